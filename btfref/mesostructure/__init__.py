@@ -1,0 +1,91 @@
+"""Modelled mesostructure: periodic geometry with materials, from which BTFs are synthesized.
+
+A mesostructure lives on the unit tile [0, 1]² of the plane spanned by x (u) and y (v), repeats without a
+seam, and lies below the sampling plane z = 0, which its highest point touches. Heights are in tile units.
+
+A new one is a module with a function ``name(**parameters) -> Mesostructure`` and a row below; third parties
+add rows through the entry-point group ``btfref.mesostructures``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from importlib.metadata import entry_points
+
+from btfref.errors import InputError
+from btfref.mesostructure.base import Mesostructure, Part
+
+__all__ = ["MESOSTRUCTURES", "Mesostructure", "Part", "build", "names"]
+
+#: name -> "module:function", imported when asked for.
+MESOSTRUCTURES = {
+    "checker": "btfref.mesostructure.checker:checker",
+    "flat": "btfref.mesostructure.flat:flat",
+}
+
+ENTRY_POINT_GROUP = "btfref.mesostructures"
+
+
+def names():
+    """Names of all mesostructures, built in and from entry points, sorted.
+
+    Returns
+    -------
+    list of str
+    """
+    return sorted({*MESOSTRUCTURES, *(point.name for point in entry_points(group=ENTRY_POINT_GROUP))})
+
+
+def _builder(name):
+    if name in MESOSTRUCTURES:
+        module, _, function = MESOSTRUCTURES[name].partition(":")
+        return getattr(importlib.import_module(module), function)
+    for point in entry_points(group=ENTRY_POINT_GROUP):
+        if point.name == name:
+            return point.load()
+    raise InputError(
+        "unknown mesostructure",
+        field="mesostructure",
+        got=repr(name),
+        expected=f"one of {', '.join(names())}",
+    )
+
+
+def build(mesostructure, **parameters):
+    """Geometry and materials of a mesostructure.
+
+    Parameters
+    ----------
+    mesostructure : str or Mesostructure
+        A registered name; a `Mesostructure` is handed through (and takes no parameters).
+    **parameters
+        Parameters of that mesostructure, e.g. ``amplitude`` in tile units.
+
+    Returns
+    -------
+    Mesostructure
+
+    Raises
+    ------
+    InputError
+        Unknown name, unknown parameter or a value out of range.
+    """
+    if isinstance(mesostructure, Mesostructure):
+        if parameters:
+            raise InputError(
+                "a built mesostructure takes no parameters",
+                field=", ".join(sorted(parameters)),
+                expected="none",
+            )
+        return mesostructure
+    builder = _builder(mesostructure)
+    known = inspect.signature(builder).parameters
+    for key in parameters:
+        if key not in known:
+            raise InputError(
+                f"mesostructure '{mesostructure}' has no such parameter",
+                field=key,
+                expected=f"one of {', '.join(known)}",
+            )
+    return builder(**parameters)

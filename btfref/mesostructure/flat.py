@@ -1,0 +1,48 @@
+"""A flat tile: the mesostructure whose BTF is known in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from btfref.errors import InputError
+from btfref.mesostructure.base import Mesostructure, Part
+
+
+def flat(*, reflectance=0.5, bsdf=None):
+    """A plane at z = 0.
+
+    Parameters
+    ----------
+    reflectance : float or sequence of 3 floats
+        Lambertian albedo ρ in [0, 1], linear RGB: B = ρ/π · cos θ_light.
+    bsdf : dict, optional
+        Any Mitsuba BSDF (JSON types) in place of the Lambertian one.
+
+    Returns
+    -------
+    Mesostructure
+
+    Raises
+    ------
+    InputError
+        Reflectance outside [0, 1].
+    """
+    rho = (
+        np.broadcast_to(np.asarray(reflectance, dtype=np.float64), 3)
+        if np.size(reflectance) in (1, 3)
+        else None
+    )
+    if rho is None or not ((rho >= 0) & (rho <= 1)).all():
+        raise InputError(
+            "albedo of the flat tile",
+            field="reflectance",
+            got=reflectance,
+            expected="1 or 3 values in [0, 1]",
+        )
+    rho = [float(value) for value in rho]
+    material = bsdf or {"type": "diffuse", "reflectance": {"type": "rgb", "value": rho}}
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float64)
+    part = Part(
+        vertices, np.array([[0, 1, 2], [0, 2, 3]]), material, normals=np.tile([0.0, 0.0, 1.0], (4, 1))
+    )
+    return Mesostructure("flat", {"reflectance": rho, "bsdf": bsdf}, (part,))

@@ -1,0 +1,72 @@
+"""Mesostructure as Mitsuba shapes: one tile as a shape group, its copies as instances."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def tile_group(mesostructure):
+    """One tile as a Mitsuba shape group; set a JIT variant first.
+
+    Parameters
+    ----------
+    mesostructure : Mesostructure
+
+    Returns
+    -------
+    mitsuba.Object
+        A ``shapegroup`` to be referred to by ``instance`` shapes.
+    """
+    import mitsuba as mi
+
+    group = {"type": "shapegroup"}
+    for index, part in enumerate(mesostructure.parts):
+        properties = mi.Properties()
+        properties["mesh_bsdf"] = mi.load_dict(part.bsdf)
+        mesh = mi.Mesh(
+            f"{mesostructure.name}_{index}",
+            len(part.vertices),
+            len(part.faces),
+            has_vertex_normals=part.normals is not None,
+            has_vertex_texcoords=True,
+            props=properties,
+        )
+        uv = part.vertices[:, :2] if part.uv is None else part.uv
+        values = mi.traverse(mesh)
+        values["vertex_positions"] = part.vertices.astype(np.float32).ravel()
+        values["faces"] = part.faces.ravel()
+        if part.normals is not None:
+            values["vertex_normals"] = np.asarray(part.normals, dtype=np.float32).ravel()
+        values["vertex_texcoords"] = np.asarray(uv, dtype=np.float32).ravel()
+        values.update()
+        group[f"part_{index}"] = mesh
+    return mi.load_dict(group)
+
+
+def tiled_shapes(mesostructure, columns, rows, to_world=None):
+    """Copies of the tile as a dict of shapes for ``mi.load_dict``.
+
+    Parameters
+    ----------
+    mesostructure : Mesostructure
+    columns, rows : iterable of int
+        Tile offsets along x and along y; every pair becomes an instance.
+    to_world : mitsuba.ScalarTransform4f, optional
+        From tile coordinates to the world.
+
+    Returns
+    -------
+    dict
+    """
+    import mitsuba as mi
+
+    transform = mi.ScalarTransform4f() if to_world is None else to_world
+    shapes = {"tile": tile_group(mesostructure)}
+    for j in rows:
+        for i in columns:
+            shapes[f"copy_{i}_{j}".replace("-", "m")] = {
+                "type": "instance",
+                "to_world": transform @ mi.ScalarTransform4f().translate([int(i), int(j), 0]),
+                "group": shapes["tile"],
+            }
+    return shapes
