@@ -1,0 +1,1 @@
+"""Pure functions shared by all methods: directions, quadrature, maps, low-rank algebra."""

@@ -1,0 +1,230 @@
+"""Interpolation over sets of directions: the one definition that all evaluators share.
+
+Two kinds of sets, one contract: ``stencil(w)`` returns indices and non-negative weights that sum to 1, are
+continuous in ``w`` and exact at the samples. On ring grids the two neighbouring rings are blended, linear in φ
+on each and linear in θ between them. Any other set is triangulated (spherical Delaunay) and blended with
+barycentric weights. What the ports need is in :meth:`arrays`, in float32; :func:`from_arrays` rebuilds the
+interpolation from those same arrays, so that the float64 definition sees exactly what the ports see.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from btfref.numerics.parabolic import hemisphere_to_square
+
+#: Columns of a row of ``triangles``: vertices a and b, dual normals of a, b and c, indices, neighbours, padding.
+TRIANGLE_FLOATS = 24
+
+#: Cells per side of the map that holds the triangle where the search starts.
+START_CELLS = 32
+
+
+@dataclass(frozen=True)
+class RingInterpolation:
+    """Interpolation on rings of equally spaced azimuths around a pole sample.
+
+    Parameters
+    ----------
+    rings : ndarray, shape (n_rings, 4)
+        Polar angle in radians, azimuth of the first sample in radians, number of samples and index of the
+        first sample, for each ring; sorted by polar angle; the first ring is the pole with one sample.
+    """
+
+    rings: np.ndarray
+
+    size = 4
+
+    def stencil(self, w, *, hold=True):
+        """Neighbouring samples of the directions ``w`` and their weights.
+
+        Parameters
+        ----------
+        w : array_like, shape (..., 3)
+            Unit vectors in the upper hemisphere.
+        hold : bool
+            True (views): the last ring is held down to the horizon. False (lights): it is held and multiplied by
+            cos θ / cos θ_last, so that the weights fall to zero at the horizon.
+
+        Returns
+        -------
+        index : ndarray of int64, shape (..., 4)
+        weight : ndarray of float64, shape (..., 4)
+        """
+        x, y, z = np.moveaxis(np.asarray(w, float), -1, 0)
+        # acos(z) would lose half of the digits near the pole.
+        theta = np.arctan2(np.hypot(x, y), z)
+        turn = np.arctan2(y, x) / (2 * np.pi)
+        table = np.asarray(self.rings, float)
+        last = len(table) - 1
+        low = np.clip(np.searchsorted(table[:, 0], theta, side="right") - 1, 0, last)
+        high = np.minimum(low + 1, last)
+        step = table[high, 0] - table[low, 0]
+        t = np.clip((theta - table[low, 0]) / np.where(step > 0, step, 1), 0, 1)
+        index, weight = [], []
+        for ring, share in ((low, 1 - t), (high, t)):
+            count = table[ring, 2]
+            position = (turn - table[ring, 1] / (2 * np.pi)) * count
+            position = position - np.floor(position / count) * count
+            first = np.minimum(np.floor(position), count - 1)
+            fraction = position - first
+            following = np.where(first + 1 < count, first + 1, 0)
+            index += [table[ring, 3] + first, table[ring, 3] + following]
+            weight += [share * (1 - fraction), share * fraction]
+        weight = np.stack(weight, -1)
+        if not hold:
+            edge = table[last, 0]
+            if np.cos(edge) > 1e-6:
+                fade = np.where(theta > edge, np.maximum(z, 0) / np.cos(edge), 1)
+                weight = weight * fade[..., None]
+        return np.stack(index, -1).astype(np.int64), weight
+
+    def arrays(self, prefix):
+        """The tables of the ports: ``{prefix}_rings``, float32 (n_rings, 4)."""
+        return {f"{prefix}_rings": np.asarray(self.rings, np.float32)}
+
+
+@dataclass(frozen=True)
+class TriangleInterpolation:
+    """Barycentric interpolation on the spherical Delaunay triangulation of scattered directions.
+
+    The triangulation includes the nadir as a vertex without data. In its triangles (a, b, nadir) only the edge
+    (a, b) carries weight: directions beyond the outermost samples take the value at the same azimuth on that edge.
+
+    Parameters
+    ----------
+    triangles : ndarray, shape (n_triangles, 24)
+        a (3), b (3), dual normals n_a, n_b, n_c (9), sample indices (3, the third is -1 beyond the edge), the
+        triangles across the edges opposite a, b and c (3), padding (3).
+    cells : ndarray, shape (START_CELLS, START_CELLS)
+        For each cell of the parabolic map the triangle that holds the cell's centre: where a search starts.
+    """
+
+    triangles: np.ndarray
+    cells: np.ndarray
+
+    size = 3
+
+    def locate(self, w):
+        """Triangle that holds each direction, by walking from the start cell; shape (..., 3) -> (...)."""
+        w = np.asarray(w, float)
+        table = np.asarray(self.triangles, float)
+        square = hemisphere_to_square(w)
+        n = len(self.cells)
+        cell = np.clip(((square + 1) * (0.5 * n)).astype(np.int64), 0, n - 1)
+        current = np.asarray(self.cells)[cell[..., 1], cell[..., 0]].astype(np.int64)
+        for _ in range(len(table)):
+            row = table[current]
+            coordinates = barycentric(row, w)
+            worst = np.argmin(coordinates, -1)
+            outside = np.take_along_axis(coordinates, worst[..., None], -1)[..., 0] < -1e-12
+            if not outside.any():
+                break
+            across = np.take_along_axis(row[..., 18:21], worst[..., None], -1)[..., 0].astype(np.int64)
+            current = np.where(outside, across, current)
+        return current
+
+    def stencil(self, w, *, hold=True):
+        """Neighbouring samples and weights, as :meth:`RingInterpolation.stencil`, with three samples."""
+        w = np.asarray(w, float)
+        row = np.asarray(self.triangles, float)[self.locate(w)]
+        weight = np.maximum(barycentric(row, w), 0)
+        beyond = row[..., 17] < 0
+        weight[..., 2] = np.where(beyond, 0, weight[..., 2])
+        weight = weight / weight.sum(-1, keepdims=True)
+        if not hold:
+            edge = weight[..., :1] * row[..., 0:3] + weight[..., 1:2] * row[..., 3:6]
+            cos_edge = edge[..., 2] / np.linalg.norm(edge, axis=-1)
+            fade = np.maximum(w[..., 2], 0) / np.maximum(cos_edge, 1e-6)
+            weight = weight * np.where(beyond, np.minimum(fade, 1), 1)[..., None]
+        return np.maximum(row[..., 15:18], 0).astype(np.int64), weight
+
+    def arrays(self, prefix):
+        """The tables of the ports: ``{prefix}_triangles`` float32 and ``{prefix}_cells`` float32."""
+        return {
+            f"{prefix}_triangles": np.asarray(self.triangles, np.float32),
+            f"{prefix}_cells": np.asarray(self.cells, np.float32),
+        }
+
+
+def barycentric(row, w):
+    """Unnormalised barycentric coordinates of ``w`` in the triangles of ``row``; (..., 24), (..., 3) -> (..., 3).
+
+    Differences to a vertex are taken first: each dual normal is orthogonal to it, and float32 ports keep their
+    accuracy next to a sample.
+    """
+    from_a, from_b = w - row[..., 0:3], w - row[..., 3:6]
+    return np.stack(
+        [
+            np.einsum("...i,...i->...", row[..., 6:9], from_b),
+            np.einsum("...i,...i->...", row[..., 9:12], from_a),
+            np.einsum("...i,...i->...", row[..., 12:15], from_a),
+        ],
+        -1,
+    )
+
+
+def triangulate(vectors):
+    """Spherical Delaunay triangulation of directions and the nadir.
+
+    Parameters
+    ----------
+    vectors : ndarray, shape (n, 3)
+        At least three unit vectors of the upper hemisphere, no two equal, not all on one great circle.
+
+    Returns
+    -------
+    TriangleInterpolation
+    """
+    from scipy.spatial import ConvexHull
+
+    n = len(vectors)
+    points = np.vstack([vectors, [[0.0, 0.0, -1.0]]])
+    # Regular sets are full of cocircular quadruples; a perturbation far below the spacing, the same in every run,
+    # makes the hull simplicial. Only its combinatorics are used.
+    radius = 1 + 1e-9 * np.random.default_rng(0).random(n + 1)
+    simplices = ConvexHull(points * radius[:, None]).simplices.astype(np.int64)
+    # The nadir goes last, so that beyond the edge the first two vertices carry the weight.
+    simplices = np.sort(simplices, axis=1)
+    simplices = simplices[np.lexsort(simplices.T[::-1])]
+    a, b, c = (points[simplices[:, k]] for k in range(3))
+    determinant = np.einsum("ij,ij->i", a, np.cross(b, c))[:, None]
+    duals = [np.cross(b, c) / determinant, np.cross(c, a) / determinant, np.cross(a, b) / determinant]
+    table = np.zeros((len(simplices), TRIANGLE_FLOATS))
+    table[:, 0:3], table[:, 3:6] = a, b
+    table[:, 6:15] = np.concatenate(duals, 1)
+    table[:, 15:18] = np.where(simplices == n, -1, simplices)
+    table[:, 18:21] = _neighbours(simplices)
+    interpolation = TriangleInterpolation(table.astype(np.float32), np.zeros((1, 1)))
+    return TriangleInterpolation(interpolation.triangles, _start_cells(interpolation))
+
+
+def _neighbours(simplices):
+    """Triangle across the edge opposite each vertex; (n, 3) -> (n, 3)."""
+    n = len(simplices)
+    edges = np.concatenate([simplices[:, [1, 2]], simplices[:, [0, 2]], simplices[:, [0, 1]]])
+    owner = np.tile(np.arange(n), 3)
+    corner = np.repeat(np.arange(3), n)
+    order = np.lexsort(edges.T)
+    first, second = order[0::2], order[1::2]
+    result = np.zeros((n, 3), np.int64)
+    result[owner[first], corner[first]] = owner[second]
+    result[owner[second], corner[second]] = owner[first]
+    return result
+
+
+def _start_cells(interpolation):
+    from btfref.numerics.parabolic import square_to_hemisphere
+
+    centre = (np.arange(START_CELLS) + 0.5) / START_CELLS * 2 - 1
+    s, t = np.meshgrid(centre, centre)
+    return interpolation.locate(square_to_hemisphere(np.stack([s, t], -1))).astype(np.float32)
+
+
+def from_arrays(arrays, prefix):
+    """The interpolation whose tables are stored under ``prefix`` (see :meth:`RingInterpolation.arrays`)."""
+    if f"{prefix}_rings" in arrays:
+        return RingInterpolation(arrays[f"{prefix}_rings"])
+    return TriangleInterpolation(arrays[f"{prefix}_triangles"], arrays[f"{prefix}_cells"])
