@@ -1,0 +1,1 @@
+"""Image comparison: metrics, statistics and gates."""

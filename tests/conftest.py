@@ -1,0 +1,123 @@
+"""What all tests share: requirements, floating-point errors, Dr.Jit state and reference data."""
+
+import gc
+import importlib.util
+import os
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+DATA = Path(__file__).parent / "data"
+
+#: What a test may need beyond the package's dependencies → how to find out whether it is there.
+CAPABILITIES = {
+    "chromium": lambda: (
+        shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    ),
+    "glslang": lambda: shutil.which("glslangValidator") or shutil.which("glslang"),
+    "sklearn": lambda: importlib.util.find_spec("sklearn"),
+    "llvm": lambda: _llvm(),
+    "gl": lambda: _gl(),
+}
+
+
+def _llvm():
+    from btfref.errors import MissingDependencyError
+    from btfref.platform import prepare_llvm
+
+    try:
+        return prepare_llvm()
+    except MissingDependencyError:
+        return None
+
+
+def _gl():
+    """A standalone EGL context can be made (decided once: making one costs a tenth of a second)."""
+    if not hasattr(_gl, "found"):
+        try:
+            import moderngl
+
+            context = moderngl.create_standalone_context(backend="egl")
+            _gl.found = context.info["GL_RENDERER"]
+            context.release()
+        except Exception:  # whatever the driver raises, the answer is no
+            _gl.found = None
+    return _gl.found
+
+
+def required(name):
+    """Whether BTFREF_REQUIRE (comma-separated names, or ``all``) says that a capability must be there."""
+    wanted = {word.strip() for word in os.environ.get("BTFREF_REQUIRE", "").split(",")}
+    return bool(wanted & {name, "all"})
+
+
+@pytest.fixture(scope="session")
+def need():
+    """``need("chromium")`` returns what was found; missing, it skips the test, or fails it where BTFREF_REQUIRE says so."""
+
+    def check(name):
+        found = CAPABILITIES[name]()
+        if not found:
+            message = f"{name} is not on this machine"
+            if required(name):
+                pytest.fail(f"{message}, but BTFREF_REQUIRE={os.environ['BTFREF_REQUIRE']}")
+            pytest.skip(message)
+        return found
+
+    return check
+
+
+@pytest.fixture
+def reference_file():
+    """Path of stored reference data in ``tests/data``; a missing reference fails the test."""
+
+    def find(name):
+        path = DATA / name
+        if not path.exists():
+            pytest.fail(f"reference {path.relative_to(DATA.parent)} is missing")
+        return path
+
+    return find
+
+
+@pytest.fixture
+def rng():
+    """A generator with a fixed seed."""
+    return np.random.default_rng(20040601)
+
+
+@pytest.fixture(autouse=True)
+def _floating_point_errors_raise():
+    """Division by zero, NaN and overflow in NumPy are errors; underflow is not: a float16 store underflows by design."""
+    with np.errstate(divide="raise", invalid="raise", over="raise", under="ignore"):
+        yield
+
+
+@pytest.fixture
+def llvm(need):
+    """Mitsuba with the variant ``llvm_ad_rgb`` set; Dr.Jit's memory is freed after the test."""
+    need("llvm")
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    yield mi
+    _free()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _free_jit_state():
+    """No array of one test module keeps memory, or leaves pending work, for the next."""
+    yield
+    if "drjit" in sys.modules:
+        _free()
+
+
+def _free():
+    import drjit as dr
+
+    gc.collect()
+    gc.collect()
+    dr.flush_malloc_cache()
