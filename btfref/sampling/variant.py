@@ -1,0 +1,46 @@
+"""Mitsuba with a chosen variant, and the caller's own variant back afterwards."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+
+from btfref.errors import InputError
+
+
+@contextmanager
+def mitsuba_variant(variant):
+    """Run a block under a Mitsuba variant; the variant set before is restored.
+
+    Parameters
+    ----------
+    variant : str
+        A JIT variant with RGB colours, e.g. "llvm_ad_rgb".
+
+    Yields
+    ------
+    module
+        ``mitsuba`` with that variant active.
+
+    Raises
+    ------
+    InputError
+        An unknown variant, or one that is not RGB or not JIT-compiled.
+    """
+    if variant.startswith("llvm"):
+        from btfref.platform import prepare_llvm
+
+        prepare_llvm()
+    import mitsuba as mi
+
+    usable = [name for name in mi.variants() if name.endswith("_rgb") and not name.startswith("scalar")]
+    if variant not in usable:
+        raise InputError(
+            "Mitsuba variant", field="variant", got=repr(variant), expected=f"one of {', '.join(usable)}"
+        )
+    previous = mi.variant()
+    mi.set_variant(variant)
+    try:
+        yield mi
+    finally:
+        if previous is not None:
+            mi.set_variant(previous)
