@@ -1,10 +1,11 @@
-"""What this machine offers: the LLVM library that Dr.Jit may load."""
+"""What this machine and this installation offer: the LLVM that Dr.Jit may load, and the shader directory."""
 
 from __future__ import annotations
 
 import glob
 import os
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 from btfref.errors import MissingDependencyError
@@ -12,7 +13,34 @@ from btfref.errors import MissingDependencyError
 #: LLVM 14 to 16 abort the process under Dr.Jit 1.5 on AVX-512 machines ("Cannot select … fminimum").
 MINIMUM_LLVM = 17
 
-_SEARCH = ("/usr/lib/*/libLLVM*.so*", "/usr/lib/libLLVM*.so*", "/usr/lib/llvm-*/lib/libLLVM*.so*", "/usr/lib64/libLLVM*.so*")
+_SEARCH = (
+    "/usr/lib/*/libLLVM*.so*",
+    "/usr/lib/libLLVM*.so*",
+    "/usr/lib/llvm-*/lib/libLLVM*.so*",
+    "/usr/lib64/libLLVM*.so*",
+)
+
+
+@dataclass(frozen=True)
+class LLVMChoice:
+    """The LLVM library that Dr.Jit is given, and why.
+
+    Parameters
+    ----------
+    path : str or None
+        Library to load; None when this machine has no usable one.
+    version : int or None
+        Its major version, None when the file name does not tell.
+    reason : str
+        One clause for the reader of ``btfref doctor``.
+    refused : tuple of (int, str)
+        Major version and path of each library found that must not be loaded.
+    """
+
+    path: str | None
+    version: int | None
+    reason: str
+    refused: tuple[tuple[int, str], ...]
 
 
 def llvm_version(path):
@@ -30,15 +58,48 @@ def llvm_version(path):
     return int(match.group(1)) if match else None
 
 
-def find_llvm():
+def find_llvm(patterns=_SEARCH):
     """All LLVM libraries on this machine as ``(major version, path)``, newest first."""
     found = {}
-    for pattern in _SEARCH:
-        for path in glob.glob(pattern):
+    for pattern in patterns:
+        for path in sorted(glob.glob(pattern)):
             version = llvm_version(path)
-            if version is not None:
+            if version is not None and os.path.exists(path):
                 found.setdefault(os.path.realpath(path), (version, path))
     return sorted(found.values(), reverse=True)
+
+
+def choose_llvm(environment=None, found=None):
+    """Decide which LLVM library Dr.Jit is to load; loads nothing itself.
+
+    Parameters
+    ----------
+    environment : mapping, optional
+        Where ``DRJIT_LIBLLVM_PATH`` is looked up; the process environment by default.
+    found : list of (int, str), optional
+        Candidates as `find_llvm` gives them, newest first.
+
+    Returns
+    -------
+    LLVMChoice
+    """
+    given = (os.environ if environment is None else environment).get("DRJIT_LIBLLVM_PATH")
+    found = find_llvm() if found is None else found
+    refused = tuple(candidate for candidate in found if candidate[0] < MINIMUM_LLVM)
+    passed_over = ""
+    if given:
+        version = llvm_version(given)
+        if not os.path.exists(given):
+            passed_over = f"DRJIT_LIBLLVM_PATH names {given}, which is not there; "
+        elif version is not None and version < MINIMUM_LLVM:
+            passed_over = f"DRJIT_LIBLLVM_PATH names LLVM {version}, which aborts the process; "
+        else:
+            return LLVMChoice(given, version, "named by DRJIT_LIBLLVM_PATH", refused)
+    for version, path in found:
+        if version >= MINIMUM_LLVM:
+            reason = f"{passed_over}newest found of version {MINIMUM_LLVM} or later"
+            return LLVMChoice(path, version, reason, refused)
+    return LLVMChoice(None, None, f"{passed_over}none found of version {MINIMUM_LLVM} or later", refused)
 
 
 def prepare_llvm():
@@ -54,16 +115,32 @@ def prepare_llvm():
     MissingDependencyError
         When no LLVM of version 17 or later is there.
     """
-    given = os.environ.get("DRJIT_LIBLLVM_PATH")
-    if given:
-        version = llvm_version(given)
-        if version is None or version >= MINIMUM_LLVM:
-            return given
-    for version, path in find_llvm():
-        if version >= MINIMUM_LLVM:
-            os.environ["DRJIT_LIBLLVM_PATH"] = path
-            return path
-    raise MissingDependencyError(
-        f"no LLVM library of version {MINIMUM_LLVM} or later for Mitsuba's llvm variants",
-        "install libllvm19 (or newer) or set DRJIT_LIBLLVM_PATH",
-    )
+    choice = choose_llvm()
+    if choice.path is None:
+        there = ", ".join(str(version) for version, _ in choice.refused)
+        raise MissingDependencyError(
+            f"no LLVM library of version {MINIMUM_LLVM} or later for Mitsuba's llvm variants"
+            + (f" (found {there}, which abort the process)" if there else ""),
+            "install libllvm19 (or newer) or set DRJIT_LIBLLVM_PATH",
+        )
+    os.environ["DRJIT_LIBLLVM_PATH"] = choice.path
+    return choice.path
+
+
+def shader_directory():
+    """Directory of the GLSL library: ``shaders/`` of a checkout, else the copy inside the installed package.
+
+    Returns
+    -------
+    pathlib.Path
+
+    Raises
+    ------
+    MissingDependencyError
+        When neither is there, so the installation is broken.
+    """
+    package = Path(__file__).resolve().parent
+    for candidate in (package / "_shaders", package.parent / "shaders"):
+        if (candidate / "lib").is_dir():
+            return candidate
+    raise MissingDependencyError("the shaders of btfref are not in this installation", "reinstall btfref")

@@ -1,0 +1,7 @@
+"""``python -m btfref``: the command line."""
+
+import sys
+
+from btfref.cli import main
+
+sys.exit(main())

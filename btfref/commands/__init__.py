@@ -1,0 +1,7 @@
+"""The commands of the command line, one module each.
+
+A module has a docstring (its first line is the help line), ``add_arguments(parser)`` and ``run(args)``, which
+returns the exit status. Modules import the library inside ``run``, so that ``btfref --help`` stays quick.
+"""
+
+COMMANDS = ("doctor", "demo", "synth", "fit", "info", "render", "realtime", "compare")

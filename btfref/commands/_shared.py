@@ -1,0 +1,207 @@
+"""What several commands share: reading arguments, progress bars, printing."""
+
+from __future__ import annotations
+
+import json
+import sys
+from argparse import ArgumentTypeError
+from pathlib import Path
+
+from btfref.errors import InputError
+
+
+def emit(text=""):
+    """Write one line to standard output."""
+    sys.stdout.write(f"{text}\n")
+
+
+def emit_json(data):
+    """Write `data` to standard output as indented JSON."""
+    emit(json.dumps(data, indent=2, ensure_ascii=False, default=_plain))
+
+
+def _plain(value):
+    """NumPy scalars and arrays and paths as what JSON knows."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"cannot write {type(value).__name__} as JSON")
+
+
+def value(text):
+    """A parameter value as typed: what JSON reads (number, boolean, null, list), else the text itself."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text
+
+
+def assignments(items, *, convert=value, option="--set"):
+    """``key=value`` arguments as a dict.
+
+    Raises
+    ------
+    InputError
+        For an argument without ``=`` or without a key, and for a key given twice.
+    """
+    result = {}
+    for item in items or ():
+        key, equals, text = item.partition("=")
+        if not equals or not key.isidentifier():
+            raise InputError("cannot read a parameter", field=option, got=repr(item), expected="key=value")
+        if key in result:
+            raise InputError("parameter given twice", field=option, got=repr(item))
+        result[key] = convert(text)
+    return result
+
+
+def size(text):
+    """``WxH`` as ``(width, height)`` in pixels, for argparse's ``type=``."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise ArgumentTypeError(f"got {text!r}, expected WxH in pixels, e.g. 640x480")
+    return int(width), int(height)
+
+
+def count(minimum=1):
+    """A reader of integers of at least `minimum`, for argparse's ``type=``."""
+
+    def read(text):
+        try:
+            number = int(text)
+        except ValueError:
+            number = None
+        if number is None or number < minimum:
+            raise ArgumentTypeError(f"got {text!r}, expected an integer ≥ {minimum}")
+        return number
+
+    return read
+
+
+def direction_set(text):
+    """A direction set by name, or from a text file with one ``theta phi`` pair in degrees per line.
+
+    Returns
+    -------
+    str or ndarray, shape (n, 3)
+        What `btfref.numerics.directions.directions` takes.
+    """
+    if not text.endswith((".txt", ".csv")):
+        return text
+    import numpy as np
+
+    try:
+        rows = [
+            line.partition("#")[0].replace(",", " ").split() for line in Path(text).read_text().splitlines()
+        ]
+        table = np.array([row for row in rows if row], float)
+    except (OSError, ValueError, UnicodeDecodeError) as error:
+        raise InputError(
+            "cannot read directions", file=text, got=error, expected="theta phi per line"
+        ) from None
+    if table.ndim != 2 or table.shape[1] != 2 or not np.isfinite(table).all():
+        raise InputError("cannot read directions", file=text, expected="two finite numbers per line, degrees")
+    theta, phi = np.deg2rad(table.T)
+    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
+
+
+def scene_file(text):
+    """Path of a scene: a file, or one of the scenes that btfref ships by its name.
+
+    Raises
+    ------
+    InputError
+        When it is neither.
+    """
+    path = Path(text)
+    if path.exists():
+        return path
+    shipped = Path(__file__).resolve().parent.parent / "scenes"
+    if (shipped / f"{text}.xml").is_file():
+        return shipped / f"{text}.xml"
+    names = sorted(p.stem for p in shipped.glob("*.xml") if not p.stem.startswith("lights"))
+    raise InputError(
+        "no such scene", file=text, expected=f"a Mitsuba scene file, or one of {', '.join(names)}"
+    )
+
+
+def output_file(text, *suffixes):
+    """Path of an output, refused early when it cannot be written or has a suffix that no writer takes.
+
+    Raises
+    ------
+    InputError
+        For an unknown suffix, or a folder that does not exist.
+    """
+    path = Path(text)
+    if suffixes and not path.name.endswith(suffixes):
+        raise InputError(
+            "cannot tell the file type", file=text, expected=f"a name ending in {' or '.join(suffixes)}"
+        )
+    if not path.parent.is_dir():
+        raise InputError("cannot write there", file=text, got="no such folder")
+    return path
+
+
+class Progress:
+    """A progress bar on standard error that appears once the work has taken two seconds.
+
+    Call it as ``progress(done, total, label)``; use it as a context manager so that the bar ends cleanly.
+    """
+
+    def __init__(self):
+        self._bar = None
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        if self._bar is not None:
+            self._bar.close()
+
+    def __call__(self, done, total, label=""):
+        from tqdm import tqdm
+
+        if self._bar is None or self._bar.desc != f"{label}: " or self._bar.total != total:
+            if self._bar is not None:
+                self._bar.close()
+            # disable=None: no bar where nobody looks (standard error is a file or a pipe).
+            self._bar = tqdm(desc=label, total=total, delay=2.0, leave=False, disable=None, file=sys.stderr)
+            self._bar.desc = f"{label}: "
+        self._bar.update(done - self._bar.n)
+
+
+def table(rows, *, header=None):
+    """Rows of cells as aligned lines; numbers to the right, text to the left."""
+    rows = [[str(cell) for cell in row] for row in rows]
+    every = [*([[str(cell) for cell in header]] if header else []), *rows]
+    if not every:
+        return []
+    widths = [max(len(row[column]) for row in every) for column in range(len(every[0]))]
+    right = [all(_numeric(row[column]) for row in rows) for column in range(len(every[0]))]
+    lines = [
+        "  ".join(
+            cell.rjust(width) if flag else cell.ljust(width)
+            for cell, width, flag in zip(row, widths, right, strict=True)
+        ).rstrip()
+        for row in every
+    ]
+    if header:
+        lines.insert(1, "  ".join("─" * width for width in widths))
+    return lines
+
+
+def _numeric(text):
+    return not text or text[0].isdigit() or text[0] in "-+–.∞"
+
+
+def bytes_text(n):
+    """A number of bytes for a reader: ``1.9 MiB (2 012 345 bytes)``."""
+    amount, unit = float(n), "bytes"
+    for unit in ("bytes", "KiB", "MiB", "GiB", "TiB"):
+        if amount < 1024 or unit == "TiB":
+            break
+        amount /= 1024
+    exact = f"{int(n):,} bytes".replace(",", " ")
+    return exact if unit == "bytes" else f"{amount:.3g} {unit} ({exact})"

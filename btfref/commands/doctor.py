@@ -1,0 +1,87 @@
+"""Examine this machine: what works, what is missing, and what mends it.
+
+Tries the Mitsuba variants and OpenGL, each in a process of its own; exit 1 when something needed is missing.
+missing are installed with apt.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from btfref.commands._shared import bytes_text, emit, emit_json
+from btfref.errors import MissingDependencyError
+
+_MARKS = {"ok": ("✓", "32"), "missing": ("✗", "31"), "warning": ("!", "33"), "absent": ("–", "2")}
+
+
+def add_arguments(parser):
+    """Describe the command's arguments."""
+    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+    parser.add_argument("--mend", action="store_true", help="install missing system libraries with apt")
+    parser.add_argument("--for-tests", action="store_true", help="with --mend: also what only the tests need")
+
+
+def run(args):
+    """Carry the command out."""
+    if args.mend:
+        return _mend(args.for_tests)
+    from btfref.doctor import examine
+
+    examination = examine()
+    if args.json:
+        emit_json(examination.to_dict())
+    else:
+        for line in lines(examination, colour=sys.stdout.isatty()):
+            emit(line)
+    return 0 if examination.ok else 1
+
+
+def lines(examination, *, colour=False):
+    """The examination for a reader, problems and their mends last."""
+
+    def paint(text, code):
+        return f"\x1b[{code}m{text}\x1b[0m" if colour else text
+
+    machine = examination.facts["machine"]
+    memory = machine["memory_total"], machine["memory_available"]
+    if None not in memory:
+        text = ", {} of {} memory free".format(*(bytes_text(n).split(" (")[0] for n in reversed(memory)))
+    yield f"{machine['system']}, {machine['cores']} cores{text if None not in memory else ''}"
+    group = None
+    for check in examination.checks:
+        if check.group != group:
+            group = check.group
+            yield ""
+            yield paint(group[0].upper() + group[1:], "1")
+        mark, code = _MARKS[check.status]
+        yield f"  {paint(mark, code)} {check.name:<17} {check.value}"
+    troubles = [check for check in examination.checks if check.mend]
+    yield ""
+    for check in troubles:
+        mark, code = _MARKS[check.status]
+        yield f"{paint(mark, code)} {check.name}: {check.value}"
+        yield f"    {check.mend}"
+    yield (
+        paint("All that btfref needs works here.", "32")
+        if examination.ok
+        else paint("Something that btfref needs is missing.", "31")
+    )
+
+
+def _mend(for_tests):
+    from btfref import system
+
+    needed = system.missing()
+    if needed:
+        emit(f"installing {', '.join(requirement.name for requirement in needed)}")
+        emit(f"installed {' '.join(system.install(needed))}")
+    if not for_tests:
+        return 0
+    for requirement in system.missing(tests=True):
+        # One by one, and without failing: a distribution may lack one, and its tests then say why they skip.
+        try:
+            emit(f"installing {requirement.name}")
+            system.install([requirement])
+        except MissingDependencyError as error:
+            sys.stderr.write(f"btfref: warning: {error}; the tests that need it are skipped\n")
+    return 0
