@@ -205,3 +205,23 @@ def bytes_text(n):
         amount /= 1024
     exact = f"{int(n):,} bytes".replace(",", " ")
     return exact if unit == "bytes" else f"{amount:.3g} {unit} ({exact})"
+
+
+def write_images(image, out, *, png=False, classes=None, classes_out=None):
+    """Write a linear image as float32 EXR, and what else was asked for.
+
+    Parameters
+    ----------
+    image : ndarray, shape (H, W, 3)
+    out : pathlib.Path
+        The EXR file; `png` adds a tone-mapped PNG of the same name.
+    classes : ndarray of uint8, shape (H, W), optional
+        Pixel classes, written to `classes_out`.
+    """
+    from btfref.compare import save_classes, save_image
+
+    save_image(out, image)
+    if png:
+        save_image(out.with_suffix(".png"), image)
+    if classes is not None:
+        save_classes(classes_out, classes)

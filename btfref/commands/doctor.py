@@ -1,7 +1,7 @@
 """Examine this machine: what works, what is missing, and what mends it.
 
-Tries the Mitsuba variants and OpenGL, each in a process of its own; exit 1 when something needed is missing.
-missing are installed with apt.
+Tries the Mitsuba variants and OpenGL, each in a process of its own; exit status 1 when something needed is
+missing. With --mend, only the system libraries are looked at, and the missing ones are installed with apt.
 """
 
 from __future__ import annotations

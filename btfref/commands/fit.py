@@ -1,0 +1,83 @@
+"""Compress a sampled BTF with one of the methods.
+
+`--preset paper` starts from the settings of the method's paper; --set overrides single parameters.
+"""
+
+from __future__ import annotations
+
+from btfref.commands._shared import Progress, assignments, bytes_text, count, emit, emit_json, output_file
+from btfref.errors import InputError
+
+
+def add_arguments(parser):
+    """Describe the command's arguments."""
+    parser.add_argument("method", metavar="METHOD", help="key of the method, e.g. lpca")
+    parser.add_argument("btf", metavar="BTF", help="a sampled BTF (.btf.zarr)")
+    parser.add_argument(
+        "-o", "--output", required=True, metavar="FILE.exr", help="the representation to write"
+    )
+    parser.add_argument(
+        "--set", nargs="+", action="extend", metavar="KEY=VALUE", help="parameters of the method"
+    )
+    parser.add_argument("--preset", metavar="NAME", help="named settings, e.g. paper")
+    parser.add_argument("--seed", type=count(0), default=0, metavar="N")
+    parser.add_argument("--json", action="store_true", help="print the facts of the file as JSON")
+
+
+def run(args):
+    """Carry the command out."""
+    from btfref.registry import method
+
+    row = method(args.method)
+    out = output_file(args.output, ".exr")
+    parameters = fit_parameters(row, args.preset, assignments(args.set))
+
+    from btfref.representations.container import read_info, save
+    from btfref.sampling import SampledBTF
+
+    btf = SampledBTF.load(args.btf)
+    with Progress() as progress:
+        representation = row.fit(btf, seed=args.seed, progress=progress, **parameters)
+    save(representation, out)
+    info = read_info(out)
+    if args.json:
+        emit_json(info)
+    else:
+        emit(f"{out}: {info['method']}, maps {bytes_text(info['payload_bytes'])}, 1:{info['ratio']:.3g}")
+    return 0
+
+
+def fit_parameters(row, preset, given):
+    """Parameters of a fit: those of the preset, overridden by the given ones.
+
+    Parameters
+    ----------
+    row : btfref.registry.Method
+    preset : str or None
+    given : dict
+
+    Raises
+    ------
+    InputError
+        For a preset or a parameter that the method does not have.
+    """
+    import inspect
+
+    parameters = {}
+    if preset is not None:
+        if preset not in row.presets:
+            expected = f"one of {', '.join(row.presets)}"
+            raise InputError(
+                f"{row.key} has no such preset", field="--preset", got=repr(preset), expected=expected
+            )
+        parameters.update(row.presets[preset])
+    known = [
+        name for name in inspect.signature(row.fit).parameters if name not in ("btf", "seed", "progress")
+    ]
+    for name in given:
+        if name not in known:
+            expected = f"one of {', '.join(known)}" if known else "none"
+            raise InputError(
+                f"{row.key} has no such parameter", field="--set", got=repr(name), expected=expected
+            )
+    return parameters | given

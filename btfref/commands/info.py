@@ -1,0 +1,126 @@
+"""Say what a representation, a sampled BTF or an image holds, from its headers only."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from btfref.commands._shared import bytes_text, emit, emit_json
+from btfref.errors import InputError
+
+_BYTES = ("payload_bytes", "file_bytes", "raw_bytes")
+
+
+def add_arguments(parser):
+    """Describe the command's arguments."""
+    parser.add_argument(
+        "file", metavar="FILE", help="representation (.exr), sampled BTF (.btf.zarr), or image"
+    )
+    parser.add_argument("--json", action="store_true", help="print the facts as JSON")
+
+
+def run(args):
+    """Carry the command out."""
+    facts = read(args.file)
+    if args.json:
+        emit_json(facts)
+    else:
+        for line in lines(facts):
+            emit(line)
+    return 0
+
+
+def read(path):
+    """Facts about a file, whatever its kind.
+
+    Returns
+    -------
+    dict
+        With ``kind``: "representation", "sampled BTF" or "image".
+
+    Raises
+    ------
+    InputError
+        When the file is missing or none of these.
+    """
+    path = Path(path)
+    if path.is_dir():
+        from btfref.sampling import open_store
+
+        return open_store(path).info()
+    if path.suffix.lower() == ".png":
+        return _png(path)
+    if path.suffix.lower() == ".exr" and _plain_exr(path):
+        return _exr(path)
+    from btfref.representations.container import read_info
+
+    return read_info(path)
+
+
+def _headers(path):
+    """Headers of an OpenEXR file, or None when it cannot be read as one."""
+    if not path.is_file() or path.stat().st_size == 0:
+        return None
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            return [part.header for part in file.parts]
+    except RuntimeError:
+        return None
+
+
+def _plain_exr(path):
+    """Whether this is an OpenEXR image rather than a representation; broken files count as the latter."""
+    from btfref.representations.container import ATTRIBUTE
+
+    headers = _headers(path)
+    return headers is not None and ATTRIBUTE not in headers[0]
+
+
+def _exr(path):
+    headers = _headers(path)
+    low, high = (corner.tolist() for corner in headers[0]["dataWindow"])
+    channels = [{"name": channel.name, "type": str(channel.type())} for channel in headers[0]["channels"]]
+    return {
+        "kind": "image",
+        "size": [high[0] - low[0] + 1, high[1] - low[1] + 1],
+        "channels": [channel["name"] for channel in channels],
+        "parts": len(headers),
+        "file_bytes": path.stat().st_size,
+    }
+
+
+def _png(path):
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            size, channels = list(image.size), list(image.getbands())
+    except (FileNotFoundError, IsADirectoryError):
+        raise InputError("no such file", file=path) from None
+    except (UnidentifiedImageError, OSError, SyntaxError):
+        raise InputError("not a PNG image", file=path) from None
+    return {"kind": "image", "size": size, "channels": channels, "file_bytes": path.stat().st_size}
+
+
+def lines(facts, indent=""):
+    """Facts as aligned ``key  value`` lines; nested ones are indented."""
+    width = max(len(key) for key in facts)
+    for key, fact in facts.items():
+        if isinstance(fact, dict) and fact:
+            yield f"{indent}{key}"
+            yield from lines(fact, indent + "  ")
+        else:
+            yield f"{indent}{key:<{width}}  {_text(key, fact)}"
+
+
+def _text(key, fact):
+    if key in _BYTES and fact is not None:
+        return bytes_text(fact)
+    if key == "ratio" and fact is not None:
+        return f"1:{fact:.4g}"
+    if key in ("shape", "size") and isinstance(fact, list | tuple):
+        return " × ".join(map(str, fact))
+    if isinstance(fact, list | tuple):
+        return ", ".join(map(str, fact)) or "none"
+    return "–" if fact is None or fact == {} else str(fact)

@@ -1,0 +1,71 @@
+"""Render a Mitsuba scene: the reference image.
+
+SCENE is a Mitsuba XML file, or one of the scenes that btfref ships: plane, sphere, cloth. Any integrator; the
+film becomes float32 with a box filter. For scenes lit by directional and point lights, --noise-free N evaluates
+the material on a regular N × N grid in each pixel, without random numbers. --geometry shows the truth beyond
+every representation: the flat shape replaced by the mesostructure itself, path traced.
+"""
+
+from __future__ import annotations
+
+from btfref.commands._shared import assignments, count, output_file, scene_file, size, write_images
+from btfref.errors import InputError
+
+
+def add_arguments(parser):
+    """Describe the command's arguments."""
+    parser.add_argument("scene", metavar="SCENE", help="scene file, or plane, sphere, cloth")
+    parser.add_argument("-o", "--output", required=True, metavar="X.exr", help="the image to write")
+    parser.add_argument(
+        "-D", dest="define", nargs="+", action="extend", metavar="KEY=VALUE", help="parameters of the scene"
+    )
+    parser.add_argument("--spp", type=count(1), metavar="N", help="samples per pixel (default: the scene's)")
+    parser.add_argument("--seed", type=count(0), default=0, metavar="N")
+    parser.add_argument("--variant", default="llvm_ad_rgb", metavar="NAME", help="Mitsuba variant")
+    parser.add_argument(
+        "--noise-free", type=count(1), metavar="N", help="regular N × N grid per pixel, delta lights"
+    )
+    parser.add_argument("--no-shadows", action="store_true", help="with --noise-free: no cast shadows")
+    parser.add_argument("--size", type=size, metavar="WxH", help="of the film, in pixels")
+    parser.add_argument("--geometry", action="store_true", help="path trace the mesostructure itself")
+    parser.add_argument("--classes", metavar="C.png", help="also write the pixel classes (for compare)")
+    parser.add_argument("--png", action="store_true", help="also write X.png, for eyes")
+
+
+def run(args):
+    """Carry the command out."""
+    scene, out = scene_file(args.scene), output_file(args.output, ".exr")
+    parameters = assignments(args.define, convert=str, option="-D")
+    if args.no_shadows and args.noise_free is None:
+        raise InputError(
+            "only the noise-free mode can leave shadows out", field="--no-shadows", expected="--noise-free N"
+        )
+    if args.geometry and args.noise_free is not None:
+        raise InputError("geometry is path traced", field="--geometry", got="--noise-free")
+    classes_out = output_file(args.classes, ".png") if args.classes else None
+
+    if args.geometry:
+        from btfref.render.geometry import render_geometry
+
+        options = {"spp": args.spp} if args.spp else {}
+        result = render_geometry(scene, parameters=parameters, seed=args.seed, size=args.size, **options)
+    else:
+        from btfref.render.reference import render
+
+        result = render(
+            scene,
+            parameters=parameters,
+            variant=args.variant,
+            spp=args.spp,
+            seed=args.seed,
+            noise_free=args.noise_free,
+            shadows=not args.no_shadows,
+            size=args.size,
+        )
+    classes = None
+    if classes_out:
+        from btfref.render.classes import pixel_classes
+
+        classes = pixel_classes(scene, parameters=parameters, size=args.size, grid=args.noise_free or 4)
+    write_images(result.image, out, png=args.png, classes=classes, classes_out=classes_out)
+    return 0

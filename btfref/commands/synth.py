@@ -1,0 +1,74 @@
+"""Path trace a modelled mesostructure into a sampled BTF.
+
+An interrupted run continues where it stopped when it is started again with the same arguments.
+"""
+
+from __future__ import annotations
+
+from btfref.commands._shared import (
+    Progress,
+    assignments,
+    bytes_text,
+    count,
+    direction_set,
+    emit,
+    emit_json,
+    output_file,
+)
+
+
+def add_arguments(parser):
+    """Describe the command's arguments."""
+    parser.add_argument("mesostructure", metavar="MESO", help="name of the mesostructure, e.g. checker")
+    parser.add_argument("-o", "--output", required=True, metavar="OUT.btf.zarr", help="the store to write")
+    parser.add_argument(
+        "--texels", type=count(1), default=64, metavar="N", help="texels per side (default 64)"
+    )
+    directions = (
+        "ubo81, ubo151, a grid such as 10x5, or a .txt file of theta and phi in degrees (default ubo81)"
+    )
+    parser.add_argument("--views", default="ubo81", metavar="SET", help=directions)
+    parser.add_argument("--lights", default="ubo81", metavar="SET", help="likewise")
+    parser.add_argument(
+        "--spp", type=count(2), default=64, metavar="N", help="paths per texel and view (default 64)"
+    )
+    parser.add_argument("--max-depth", type=count(2), default=8, metavar="N", help="as Mitsuba's (default 8)")
+    parser.add_argument("--seed", type=count(0), default=0, metavar="N")
+    parser.add_argument(
+        "--dtype", choices=("float16", "float32"), default="float16", help="of the stored values"
+    )
+    parser.add_argument(
+        "--set", nargs="+", action="extend", metavar="KEY=VALUE", help="parameters of the mesostructure"
+    )
+    parser.add_argument("--json", action="store_true", help="print the facts of the store as JSON")
+
+
+def run(args):
+    """Carry the command out."""
+    out = output_file(args.output, ".btf.zarr")
+    parameters = assignments(args.set)
+    views, lights = direction_set(args.views), direction_set(args.lights)
+
+    from btfref.sampling import open_store
+    from btfref.sampling.synthesis import synthesize
+
+    with Progress() as progress:
+        synthesize(
+            args.mesostructure,
+            texels=args.texels,
+            views=views,
+            lights=lights,
+            spp=args.spp,
+            seed=args.seed,
+            out=out,
+            max_depth=args.max_depth,
+            dtype=args.dtype,
+            progress=progress,
+            **parameters,
+        )
+    info = open_store(out).info()
+    if args.json:
+        emit_json(info)
+    else:
+        emit(f"{out}: {' × '.join(map(str, info['shape']))}, {bytes_text(info['file_bytes'])}")
+    return 0
