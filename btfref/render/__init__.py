@@ -1,0 +1,1 @@
+"""Reading scenes and rendering them: the Mitsuba reference, the real-time renderer and the GLSL composer."""

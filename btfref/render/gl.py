@@ -1,0 +1,213 @@
+"""OpenGL without a window: context, tables as textures, programs whose errors name files.
+
+Nothing here knows a method: a representation comes as its port arrays and its GLSL file.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from btfref.errors import BtfrefError, InputError, MissingDependencyError
+from btfref.render import composer
+
+#: Texels of a row of a table's texture; shaders/lib/table.glsl takes the index apart with the same number.
+TABLE_WIDTH = 4096
+
+_DTYPES = {"float16": "f2", "float32": "f4", "uint32": "u4"}
+
+
+@cache
+def context():
+    """The process's OpenGL context (EGL, no window).
+
+    Returns
+    -------
+    moderngl.Context
+
+    Raises
+    ------
+    MissingDependencyError
+        When no OpenGL 3.3 driver can be reached.
+    """
+    # Mesa's llvmpipe otherwise filters 8-bit textures on a path whose rounding differs between processors.
+    os.environ.setdefault("GALLIVM_PERF", "no_aos_sampling")
+    import moderngl
+
+    try:
+        return moderngl.create_context(standalone=True, backend="egl", require=330)
+    except Exception as error:  # moderngl and glcontext raise bare Exception
+        raise MissingDependencyError(
+            f"no OpenGL 3.3 context through EGL ({error})",
+            "install libegl1 libgl1-mesa-dri libgles2, or a GPU driver with EGL",
+        ) from error
+
+
+def facts(ctx):
+    """Vendor, renderer and version of the driver, as a dict of str."""
+    names = {"gl_vendor": "GL_VENDOR", "gl_renderer": "GL_RENDERER", "gl_version": "GL_VERSION"}
+    return {key: ctx.info[name] for key, name in names.items()}
+
+
+def upload(ctx, array, name):
+    """A table as an array texture of RGBA texels in C order.
+
+    Parameters
+    ----------
+    ctx : moderngl.Context
+    array : ndarray of float16, float32 or uint32, shape (..., k)
+        k is a multiple of 4.
+    name : str
+        For error messages.
+
+    Returns
+    -------
+    moderngl.TextureArray
+        4096 texels wide; texel i is at x = i mod 4096, y = (i div 4096) mod 4096, layer = i div 4096².
+
+    Raises
+    ------
+    InputError
+        For another type or shape, or a table larger than the driver's textures.
+    """
+    dtype = _DTYPES.get(array.dtype.name)
+    if dtype is None or array.shape[-1] % 4 or not array.size:
+        raise InputError(
+            "a table that GLSL cannot read",
+            field=name,
+            got=f"{array.dtype} {array.shape}",
+            expected=f"{', '.join(_DTYPES)}, last axis a multiple of 4",
+        )
+    texels = array.size // 4
+    rows = -(-texels // TABLE_WIDTH)
+    layers = -(-rows // TABLE_WIDTH)
+    height = min(rows, TABLE_WIDTH)
+    limit = ctx.info["GL_MAX_ARRAY_TEXTURE_LAYERS"]
+    if layers > limit or texels > np.iinfo(np.int32).max:
+        raise InputError("a table is too large for this driver", field=name, got=f"{texels} RGBA texels")
+    flat = np.ascontiguousarray(array).reshape(-1)
+    padded = layers * height * TABLE_WIDTH * 4
+    if padded != flat.size:
+        flat = np.concatenate([flat, np.zeros(padded - flat.size, flat.dtype)])
+    texture = ctx.texture_array((TABLE_WIDTH, height, layers), 4, flat.data, dtype=dtype)
+    # Unfiltered, without mipmaps: texelFetch of an incomplete texture would return zeros.
+    texture.filter = (ctx.NEAREST, ctx.NEAREST)
+    return texture
+
+
+@dataclass
+class ShaderRepresentation:
+    """A representation on the GPU: its tables, its constants and its GLSL file.
+
+    Parameters
+    ----------
+    textures : dict of str to moderngl.TextureArray
+        By sampler name.
+    defines : dict
+        Constants for the composer.
+    shader : str
+        File with ``btf_eval``.
+    directories : list of path-like
+        Where to look for it before the library.
+    """
+
+    textures: dict
+    defines: dict
+    shader: str
+    directories: list
+
+    @classmethod
+    def upload(cls, ctx, rep, *, filter_type=None):
+        """Put ``rep`` on the GPU; ``filter_type`` overrides the file's texel filter."""
+        return cls(
+            {name: upload(ctx, array, name) for name, array in rep.port_arrays().items()},
+            shader_defines(rep, filter_type=filter_type),
+            *shader_file(rep),
+        )
+
+    def program(self, ctx, vertex, fragment=None, *, varyings=(), defines=None):
+        """Compile hosts with this representation; see :func:`compile_program`."""
+        return compile_program(
+            ctx,
+            vertex,
+            fragment,
+            varyings=varyings,
+            defines={**self.defines, **(defines or {})},
+            representation=self.shader,
+            directories=self.directories,
+        )
+
+    def release(self):
+        """Give the textures back."""
+        for texture in self.textures.values():
+            texture.release()
+
+
+def shader_defines(rep, *, filter_type=None):
+    """Constants of a representation's shader, the texel filter included; for the composer."""
+    filter_type = filter_type or rep.meta["filter_type"]
+    return {**composer.representation_defines(rep), "FILTER_BILINEAR": filter_type == "bilinear"}
+
+
+def shader_file(rep):
+    """The GLSL file of a representation's method and the directories to look for it."""
+    from importlib.resources import files
+
+    from btfref.registry import method
+
+    row = method(rep.meta["method"])
+    return row.shader, [files(row.shader_package)] if row.shader_package else []
+
+
+def compile_program(ctx, vertex, fragment=None, *, varyings=(), **composition):
+    """Compose, compile and link two hosts.
+
+    Parameters
+    ----------
+    ctx : moderngl.Context
+    vertex, fragment : str
+        Host files.
+    varyings : sequence of str
+        Outputs for transform feedback.
+    **composition
+        For :func:`btfref.render.composer.compose`.
+
+    Returns
+    -------
+    moderngl.Program
+
+    Raises
+    ------
+    BtfrefError
+        With the compiler's message in terms of files and lines.
+    """
+    stages = {"vertex_shader": composer.compose(vertex, **composition)}
+    if fragment:
+        stages["fragment_shader"] = composer.compose(fragment, **composition)
+    try:
+        return ctx.program(**{name: str(source) for name, source in stages.items()}, varyings=varyings)
+    except Exception as error:  # moderngl.Error, whose text holds the log of one stage
+        source = stages["fragment_shader" if "fragment_shader" in str(error) else "vertex_shader"]
+        raise BtfrefError(f"shader {vertex} {fragment or ''}: {source.explain(str(error))}") from error
+
+
+def bind(program, textures, *, first=0):
+    """Give every texture a unit and tell the samplers; samplers that the compiler dropped are skipped."""
+    for unit, (name, texture) in enumerate(sorted(textures.items()), start=first):
+        if name in program:
+            texture.use(unit)
+            program[name].value = unit
+
+
+def set_uniforms(program, values):
+    """Set uniforms by name; those that the compiler dropped are skipped."""
+    for name, value in values.items():
+        if name in program:
+            array = np.ascontiguousarray(value)
+            if array.dtype.kind == "f":
+                program[name].write(array.astype(np.float32).tobytes())
+            else:
+                program[name].value = value

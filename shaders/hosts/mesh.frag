@@ -1,0 +1,46 @@
+// Provides the radiance towards the camera under directional and point lights, without cast shadows.
+// Expects a representation, the tables of hosts/mesh.vert, the camera's rays, the lights and the material.
+
+#include "lib/frame.glsl"
+#include "lib/lights.glsl"
+#include "lib/triangle_table.glsl"
+#include "representation"
+
+uniform sampler2DArray triangles;
+uniform vec3 camera_origin;
+uniform vec3 ray_corner;    // towards film coordinate (0, 0), the top left corner
+uniform vec3 ray_right;     // change per pixel to the right
+uniform vec3 ray_down;      // change per pixel downwards
+uniform vec2 film_offset;   // from gl_FragCoord.x and height - gl_FragCoord.y to the film coordinate of the sample
+uniform float film_height;
+uniform vec3 uv_row0;       // texture transform: u' = dot(uv_row0, (u, v, 1))
+uniform vec3 uv_row1;
+uniform float scale;
+uniform bool two_sided;
+
+flat in int triangle;
+
+out vec4 radiance;
+
+void main() {
+    vec2 film = vec2(gl_FragCoord.x, film_height - gl_FragCoord.y) + film_offset;
+    vec3 direction = normalize(ray_corner + film.x * ray_right + film.y * ray_down);
+    SurfacePoint point = triangle_intersect(triangles, triangle, camera_origin, direction);
+    mat3 to_local = shading_frame(point.normal, point.dp_du);
+    vec3 uv1 = vec3(point.uv, 1.0);
+    vec2 uv = vec2(dot(uv_row0, uv1), dot(uv_row1, uv1));
+    vec3 w_view = to_local * -direction;
+    // As Mitsuba's twosided: seen from behind, both directions are mirrored at the surface, the frame stays.
+    float side = two_sided && w_view.z < 0.0 ? -1.0 : 1.0;
+    w_view.z *= side;
+    vec3 sum = vec3(0.0);
+    for (int i = 0; i < N_LIGHTS; ++i) {
+        vec3 towards;
+        vec3 irradiance = light_incident(i, point.position, towards);
+        vec3 w_light = to_local * towards;
+        w_light.z *= side;
+        // B holds the cosine of the light (design: conventions), nothing else is multiplied.
+        sum += irradiance * btf_eval(uv, w_light, w_view, 0.0);
+    }
+    radiance = vec4(scale * sum, 1.0);
+}

@@ -1,0 +1,16 @@
+// Provides one value of B for each vertex, through transform feedback: what the agreement tests compare.
+// Expects a representation; attributes uv, w_light, w_view (local frame, unit length) and lod.
+
+#include "representation"
+
+in vec2 uv;
+in vec3 w_light;
+in vec3 w_view;
+in float lod;
+
+out vec3 value;
+
+void main() {
+    value = btf_eval(uv, w_light, w_view, lod);
+    gl_Position = vec4(0.0, 0.0, 0.0, 1.0);
+}

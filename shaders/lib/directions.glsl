@@ -1,0 +1,49 @@
+// Provides view_stencil and light_stencil: neighbours of a direction among the measured ones; directions_valid.
+// Expects the samplers view_rings or view_triangles and view_cells, the same for light_, and light_directions.
+
+#if defined(VIEW_RINGS_DIM0) || defined(LIGHT_RINGS_DIM0)
+#include "lib/rings.glsl"
+#endif
+#if defined(VIEW_TRIANGLES_DIM0) || defined(LIGHT_TRIANGLES_DIM0)
+#include "lib/triangles.glsl"
+#endif
+
+#ifdef VIEW_RINGS_DIM0
+uniform sampler2DArray view_rings;
+#else
+uniform sampler2DArray view_triangles;
+uniform sampler2DArray view_cells;
+#endif
+
+#ifdef LIGHT_RINGS_DIM0
+uniform sampler2DArray light_rings;
+uniform sampler2DArray light_directions;
+#else
+uniform sampler2DArray light_triangles;
+uniform sampler2DArray light_cells;
+#endif
+
+// Above the horizon and neither NaN nor far from unit length (comparisons with NaN are false).
+bool directions_valid(vec3 w_light, vec3 w_view) {
+    return w_light.z > 0.0 && w_view.z > 0.0 && dot(w_light, w_light) < 4.0 && dot(w_view, w_view) < 4.0;
+}
+
+Stencil view_stencil(vec3 w) {
+#ifdef VIEW_RINGS_DIM0
+    return ring_stencil(view_rings, VIEW_RINGS_DIM0, w);
+#else
+    return triangle_stencil(view_triangles, VIEW_TRIANGLES_DIM0, view_cells, VIEW_CELLS_DIM0, w, false);
+#endif
+}
+
+// Below the outermost samples the weights sum to cos(theta)/cos(theta_last), so that B falls to zero at the horizon.
+Stencil light_stencil(vec3 w) {
+#ifdef LIGHT_RINGS_DIM0
+    Stencil s = ring_stencil(light_rings, LIGHT_RINGS_DIM0, w);
+    float cos_last = table_fetch(light_directions, LIGHT_DIRECTIONS_DIM0 - 1).z;
+    s.weight *= ring_fade(light_rings, LIGHT_RINGS_DIM0, w, cos_last);
+    return s;
+#else
+    return triangle_stencil(light_triangles, LIGHT_TRIANGLES_DIM0, light_cells, LIGHT_CELLS_DIM0, w, true);
+#endif
+}
