@@ -196,6 +196,15 @@ def _numeric(text):
     return not text or text[0].isdigit() or text[0] in "-+–.∞"
 
 
+def number(value):
+    """A metric for a reader: four significant digits, a dash for none."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool | str):
+        return str(value)
+    return f"{value:.4g}"
+
+
 def bytes_text(n):
     """A number of bytes for a reader: ``1.9 MiB (2 012 345 bytes)``."""
     amount, unit = float(n), "bytes"

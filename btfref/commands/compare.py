@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from btfref.commands._shared import emit, emit_json, output_file, table
+from btfref.commands._shared import emit, emit_json, number, output_file, table
 
 
 def add_arguments(parser):
@@ -60,12 +60,3 @@ def lines(comparison):
         yield f"{verdict}  {gate.name}: {number(gate.value)}, limit {number(gate.limit)}"
         if not gate.passed:
             yield f"      {gate.reason}"
-
-
-def number(value):
-    """A metric for a reader: four significant digits, a dash for none."""
-    if value is None:
-        return "–"
-    if isinstance(value, bool | str):
-        return str(value)
-    return f"{value:.4g}"

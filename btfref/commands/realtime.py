@@ -23,7 +23,7 @@ def add_arguments(parser):
     parser.add_argument("scene", metavar="SCENE", help="scene file, or plane, sphere, cloth")
     parser.add_argument("-o", "--output", required=True, metavar="X.exr", help="the image to write")
     parser.add_argument(
-        "-D", dest="define", nargs="+", action="extend", metavar="KEY=VALUE", help="parameters of the scene"
+        "-D", dest="define", action="append", metavar="KEY=VALUE", help="parameter of the scene"
     )
     parser.add_argument("--grid", type=count(1), default=4, metavar="N", help="N × N sub-pixels (default 4)")
     parser.add_argument("--size", type=size, metavar="WxH", help="of the image, in pixels")

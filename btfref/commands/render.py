@@ -1,7 +1,7 @@
 """Render a Mitsuba scene: the reference image.
 
 SCENE is a Mitsuba XML file, or one of the scenes that btfref ships: plane, sphere, cloth. Any integrator; the
-film becomes float32 with a box filter. For scenes lit by directional and point lights, --noise-free N evaluates
+film becomes float32 with a box filter. Where all lights are directional or points, --noise-free N evaluates
 the material on a regular N × N grid in each pixel, without random numbers. --geometry shows the truth beyond
 every representation: the flat shape replaced by the mesostructure itself, path traced.
 """
@@ -17,7 +17,7 @@ def add_arguments(parser):
     parser.add_argument("scene", metavar="SCENE", help="scene file, or plane, sphere, cloth")
     parser.add_argument("-o", "--output", required=True, metavar="X.exr", help="the image to write")
     parser.add_argument(
-        "-D", dest="define", nargs="+", action="extend", metavar="KEY=VALUE", help="parameters of the scene"
+        "-D", dest="define", action="append", metavar="KEY=VALUE", help="parameter of the scene"
     )
     parser.add_argument("--spp", type=count(1), metavar="N", help="samples per pixel (default: the scene's)")
     parser.add_argument("--seed", type=count(0), default=0, metavar="N")
