@@ -56,7 +56,7 @@ def required(name):
 
 @pytest.fixture(scope="session")
 def need():
-    """``need("chromium")`` returns what was found; missing, it skips the test, or fails it where BTFREF_REQUIRE says so."""
+    """``need("gl")`` returns what was found; missing, it skips the test, or fails it if BTFREF_REQUIRE says so."""
 
     def check(name):
         found = CAPABILITIES[name]()
@@ -91,7 +91,7 @@ def rng():
 
 @pytest.fixture(autouse=True)
 def _floating_point_errors_raise():
-    """Division by zero, NaN and overflow in NumPy are errors; underflow is not: a float16 store underflows by design."""
+    """Division by zero, NaN and overflow in NumPy are errors; a float16 store underflows by design."""
     with np.errstate(divide="raise", invalid="raise", over="raise", under="ignore"):
         yield
 

@@ -130,7 +130,7 @@ def tolerance(key):
     Parameters
     ----------
     key : str
-        ``"gate.entry"``, for example ``"image.noise_free.p999"``; or the gate alone when it holds a single number.
+        ``"gate.entry"``, for example ``"image.noise_free.p999"``; or the gate alone when it holds one number.
 
     Returns
     -------

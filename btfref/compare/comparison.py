@@ -1,0 +1,376 @@
+"""Comparison of a test image with a reference: errors by pixel class, statistics, gates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from btfref.compare import metrics, significance
+from btfref.compare.colour import delta_e00, fit_display
+from btfref.compare.flip import exposure_range, flip_map
+from btfref.compare.gates import GateResult, Measured, judge
+from btfref.compare.tolerances import gate_table, limits, tolerance
+from btfref.errors import InputError
+
+#: Pixel class → its number in a class map.
+CLASSES = {"background": 0, "interior": 1, "silhouette": 2}
+CONFIDENCE = 0.99
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """What `compare` found.
+
+    Parameters
+    ----------
+    metrics : dict of str to dict of str to float
+        Class (``interior``, ``silhouette``, ``background``, ``all``; those with pixels) → name → number.
+    gates : tuple of GateResult
+        ``image.finite`` first, then those asked for.
+    settings : dict
+        Every constant that decides a number: ε, floor, peak, exposures, tone mapping.
+    counts : dict
+        Pixels per class, non-finite and negative pixels of each side.
+    statistics : dict
+        Class → confidence intervals and the difference test; empty without variances.
+    maps : dict of str to array
+        ``difference`` (H, W, 3) test - reference; ``relative``, ``delta_e00`` and, unless left out, ``flip``
+        (H, W); ``p_value`` (H, W, 3) with variances. NaN where a pixel is not finite.
+    test, reference : (H, W, 3) float64 arrays or None
+    classes : (H, W) uint8 array or None
+    variance : (H, W, 3) float64 array or None
+        Of test - reference.
+    """
+
+    metrics: dict
+    gates: tuple = ()
+    settings: dict = field(default_factory=dict)
+    counts: dict = field(default_factory=dict)
+    statistics: dict = field(default_factory=dict)
+    maps: dict = field(default_factory=dict, repr=False)
+    test: np.ndarray | None = field(default=None, repr=False)
+    reference: np.ndarray | None = field(default=None, repr=False)
+    classes: np.ndarray | None = field(default=None, repr=False)
+    variance: np.ndarray | None = field(default=None, repr=False)
+
+    @property
+    def passed(self):
+        """Whether there are gates and all of them passed."""
+        return bool(self.gates) and all(gate.passed for gate in self.gates)
+
+    def to_dict(self):
+        """Strict JSON: numbers, text and truth values; what is not finite as ``"inf"``, ``"-inf"``, ``"nan"``."""
+        return json_safe(
+            {
+                "kind": "comparison",
+                "schema": 1,
+                "passed": self.passed,
+                "shape": None if self.test is None else list(self.test.shape),
+                "counts": self.counts,
+                "settings": self.settings,
+                "metrics": self.metrics,
+                "statistics": self.statistics,
+                "gates": [gate.to_dict() for gate in self.gates],
+            }
+        )
+
+
+def json_safe(value):
+    """A copy that strict JSON can hold: NumPy values become numbers and lists, non-finite numbers text."""
+    if isinstance(value, dict):
+        return {str(key): json_safe(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [json_safe(entry) for entry in value]
+    if isinstance(value, np.ndarray):
+        return json_safe(value.tolist())
+    if isinstance(value, np.generic):
+        return json_safe(value.item())
+    if isinstance(value, float) and not np.isfinite(value):
+        return "nan" if value != value else ("inf" if value > 0 else "-inf")
+    return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
+
+
+def compare(test, reference, *, classes=None, gate=None, variance=None, display=None, flip=True):
+    """Compare two pictures of linear radiance.
+
+    Parameters
+    ----------
+    test, reference : path-like, (H, W, 3) array, or an object with ``image`` and perhaps ``variance``
+        Linear Rec. 709. Paths are read by `load_image`.
+    classes : (H, W) integer array, optional
+        0 background, 1 interior, 2 silhouette. Without it every pixel counts as interior: nothing is excused.
+    gate : str or sequence of str, optional
+        Keys of ``tolerances.toml``; ``image.finite`` is always applied.
+    variance : (H, W, 3) array or pair of such, optional
+        Variance of the mean: of test - reference, or of each. Default: what the arguments carry.
+    display : Display, optional
+        For ΔE00 and SSIM; default `fit_display` of the reference.
+    flip : bool, optional
+        Whether to compute HDR-FLIP.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    InputError
+        Unreadable files, shapes that differ, an unknown gate or class.
+    """
+    sides = [_image(side, name) for side, name in ((test, "test"), (reference, "reference"))]
+    (t, r), carried = [image for image, _ in sides], [v for _, v in sides]
+    metrics.paired(t, r)
+    classes = _class_map(classes, t.shape[:2])
+    variance = _variance(variance, carried, t.shape)
+    keys = (gate,) if isinstance(gate, str) else tuple(gate or ())
+    finite = np.isfinite(t).all(-1) & np.isfinite(r).all(-1)
+    masks = {name: finite & (classes == number) for name, number in CLASSES.items()} | {"all": finite}
+    masks = {name: mask for name, mask in masks.items() if mask.any()}
+
+    shown = finite & (classes != CLASSES["background"])
+    display = display or fit_display(r, shown)
+    clean_t, clean_r = (np.where(finite[..., None], x, 0.0) for x in (t, r))
+    peak = float(np.abs(clean_r).max()) or 1.0
+    settings = {
+        "relmse_epsilon": metrics.RELMSE_EPSILON,
+        "smape_epsilon": metrics.SMAPE_EPSILON,
+        "relative_floor": metrics.FLOOR,
+        "psnr_peak": peak,
+        "ssim": "Gaussian window, sigma 1.5, on display-encoded values",
+        "display": display.to_dict(),
+        "confidence": CONFIDENCE,
+    }
+    maps = {"difference": np.where(finite[..., None], clean_t - clean_r, np.nan).astype(np.float32)}
+    maps["delta_e00"] = delta_e00(clean_t, clean_r, display)
+    ssim = metrics.ssim_map(display.encoded(clean_t), display.encoded(clean_r)).mean(-1)
+    if flip:
+        start, stop, exposures = exposure_range(clean_r, shown)
+        maps["flip"], settings["flip"] = flip_map(
+            clean_t, clean_r, start=start, stop=stop, exposures=exposures
+        )
+    relative = np.full(finite.shape, np.nan)
+    for name in CLASSES:
+        if name in masks:
+            mask = masks[name]
+            relative[mask] = metrics.relative_error(t[mask], r[mask]).max(-1)
+    maps["relative"] = relative
+
+    found = {
+        name: _class_metrics(t[mask], r[mask], {k: maps[k][mask] for k in maps}, ssim[mask], peak)
+        for name, mask in masks.items()
+    }
+    statistics = {}
+    if variance is not None:
+        maps["p_value"] = np.full(t.shape, np.nan)
+        known = finite & np.isfinite(variance).all(-1)
+        maps["p_value"][known] = significance.welch_test(t[known], variance[known], r[known], 0.0)[1]
+        statistics = {
+            name: _class_statistics(t, r, variance, mask & known, maps["p_value"])
+            for name, mask in masks.items()
+            if (mask & known).any()
+        }
+    counts = {name: int(np.count_nonzero(classes == number)) for name, number in CLASSES.items()} | {
+        "all": int(classes.size),
+        "nonfinite_test": int(np.count_nonzero(~np.isfinite(t).all(-1))),
+        "nonfinite_reference": int(np.count_nonzero(~np.isfinite(r).all(-1))),
+        "negative_test": int(np.count_nonzero((clean_t < 0).any(-1))),
+        "negative_reference": int(np.count_nonzero((clean_r < 0).any(-1))),
+    }
+    comparison = Comparison(
+        found,
+        (),
+        settings,
+        counts,
+        statistics,
+        maps,
+        t,
+        r,
+        classes,
+        variance,
+    )
+    gates = [result for key in ("image.finite", *keys) for result in _judge(key, comparison, masks)]
+    return replace(comparison, gates=tuple(dict.fromkeys(gates)))
+
+
+def agreement(test, reference, *, gate="probe.agreement"):
+    """Compare lists of values (probes) instead of pictures.
+
+    Parameters
+    ----------
+    test, reference : (..., C) array
+        Values of one shape; an entry counts by its worst channel.
+    gate : str, optional
+        Key of ``tolerances.toml`` with limits among p50, p99, p999, max, rmse, mae, bias and ``floor``.
+
+    Returns
+    -------
+    Comparison
+        Without maps and pictures; ``settings["worst"]`` is the flat index of the worst entry. NaN and infinity
+        fail.
+    """
+    t, r = metrics.paired(test, reference)
+    t, r = t.reshape(-1, t.shape[-1]), r.reshape(-1, r.shape[-1])
+    finite = np.isfinite(t).all(-1) & np.isfinite(r).all(-1)
+    bad = int(np.count_nonzero(~finite))
+    floor = float(gate_table(gate).get("floor", metrics.FLOOR))
+    values, worst = {}, None
+    if finite.any():
+        error = metrics.relative_error(t[finite], r[finite], floor=floor).max(-1)
+        worst = int(np.flatnonzero(finite)[np.argmax(error)])
+        values = {name: getattr(metrics, name)(t[finite], r[finite]) for name in ("rmse", "mae", "bias")}
+        values |= metrics.percentiles(error)
+    wanted = [entry.removeprefix("min_") for entry in limits(gate_table(gate))]
+    measured = {name: Measured(values.get(name)) for name in wanted}
+    if bad:
+        text = f"{bad} of {len(t)} values are not finite"
+        measured = {name: Measured(m.value, "fail", text) for name, m in measured.items()}
+    return Comparison(
+        {"all": {"count": len(t), **values}},
+        tuple(judge(gate, measured)),
+        {"relative_floor": floor, "worst": worst},
+        {"all": len(t), "nonfinite": bad},
+    )
+
+
+def _image(side, name):
+    carried = getattr(side, "variance", None)
+    if hasattr(side, "image"):
+        side = side.image
+    elif isinstance(side, str) or hasattr(side, "__fspath__"):
+        from btfref.compare.images import load_image
+
+        side = load_image(side)
+    image = np.asarray(side, np.float64)
+    if image.ndim != 3 or image.shape[-1] != 3:
+        raise InputError(f"the {name} is no picture", field="shape", got=image.shape, expected="(H, W, 3)")
+    return image, carried
+
+
+def _class_map(classes, shape):
+    if classes is None:
+        return np.full(shape, CLASSES["interior"], np.uint8)
+    classes = np.asarray(classes)
+    if classes.shape != shape:
+        raise InputError("class map and picture differ", field="classes", got=classes.shape, expected=shape)
+    unknown = sorted(set(np.unique(classes).tolist()) - set(CLASSES.values()))
+    if unknown:
+        raise InputError("unknown pixel class", field="classes", got=unknown, expected=CLASSES)
+    return classes.astype(np.uint8)
+
+
+def _variance(variance, carried, shape):
+    if variance is None:
+        parts = [v for v in carried if v is not None]
+    else:
+        parts = list(variance) if isinstance(variance, (tuple, list)) else [variance]
+    for part in parts:
+        if np.shape(part) != shape:
+            raise InputError(
+                "variance and picture differ", field="variance", got=np.shape(part), expected=shape
+            )
+    return sum(np.asarray(part, np.float64) for part in parts) if parts else None
+
+
+def _class_metrics(t, r, maps, ssim, peak):
+    found = {"count": len(t), "mean_reference": float(r.mean()), "max_reference": float(np.abs(r).max())}
+    for name in ("bias", "bias_fraction", "mae", "rmse", "nrmse", "relmse", "smape"):
+        found[name] = getattr(metrics, name)(t, r)
+    found["max_abs"] = float(np.abs(t - r).max())
+    found["psnr"] = metrics.psnr(t, r, peak=peak)
+    found["ssim"] = float(ssim.mean())
+    found |= {f"rel_{k}": v for k, v in metrics.percentiles(metrics.relative_error(t, r).max(-1)).items()}
+    for name in ("delta_e00", "flip"):
+        if name in maps:
+            values = maps[name].astype(np.float64)
+            spread = metrics.percentiles(values)
+            found |= {
+                f"{name}_mean": float(values.mean()),
+                f"{name}_p99": spread["p99"],
+                f"{name}_max": spread["max"],
+            }
+    return found
+
+
+def _class_statistics(t, r, variance, mask, p_values):
+    d, v = (t - r)[mask], variance[mask]
+    mse = significance.mse_interval(d, v, confidence=CONFIDENCE)
+    return {
+        "bias": significance.bias_interval(d, v, confidence=CONFIDENCE).to_dict(),
+        "rmse_without_noise": significance.rmse_interval(mse).to_dict(),
+        "noise": float(np.sqrt(v.mean())),
+        "difference": significance.difference_test(
+            p_values[mask], significance=tolerance("image.difference.significance")
+        ).to_dict(),
+    }
+
+
+def _judge(key, comparison, masks) -> list[GateResult]:
+    """Apply one gate to a comparison of pictures."""
+    table = gate_table(key)
+    name = table.get("class", "interior")
+    wanted = [entry.removeprefix("min_") for entry in limits(table)]
+    if name not in (*CLASSES, "all"):
+        raise InputError("unknown pixel class", file="tolerances.toml", field=f"{key}.class", got=name)
+    if wanted == ["nonfinite"]:
+        bad = {side: comparison.counts[f"nonfinite_{side}"] for side in ("test", "reference")}
+        detail = ", ".join(f"{n} in the {side}" for side, n in bad.items() if n)
+        return judge(
+            key,
+            {
+                "nonfinite": Measured(
+                    sum(bad.values()), None, detail and f"pixels that are not finite: {detail}"
+                )
+            },
+            pixel_class=name,
+        )
+    if name not in masks:
+        outcome = "empty" if table.get("may_be_empty") else "fail"
+        detail = f"no finite {name} pixels"
+        return judge(key, dict.fromkeys(wanted, Measured(None, outcome, detail)), pixel_class=name)
+    return judge(
+        key, {w: _measure(w, name, table, comparison, masks[name]) for w in wanted}, pixel_class=name
+    )
+
+
+def _measure(entry, name, table, comparison, mask):
+    t, r = comparison.test[mask], comparison.reference[mask]
+    if entry in metrics.PERCENTILES or entry == "failing_fraction":
+        error = metrics.relative_error(t, r, floor=table.get("floor", metrics.FLOOR)).max(-1)
+        if entry == "failing_fraction":
+            return float(np.mean(error > table["failing_above"]))
+        return metrics.percentiles(error)[entry]
+    if entry in ("rejected_fraction", "relative_rmse"):
+        if comparison.variance is None:
+            return Measured(None, "fail", "needs the variance of the reference, none was given")
+        known = np.isfinite(comparison.variance[mask]).all(-1)
+        if not known.all():
+            return Measured(None, "fail", f"variance is not finite at {np.count_nonzero(~known)} pixels")
+        v = comparison.variance[mask]
+        if entry == "rejected_fraction":
+            p = significance.welch_test(t, v, r, 0.0)[1]
+            return significance.difference_test(p, significance=table["significance"]).rejected_fraction
+        return _equivalence(t, r, v, table)
+    if entry in comparison.metrics[name]:
+        return comparison.metrics[name][entry]
+    raise InputError(
+        "no such measure", file="tolerances.toml", field=entry, expected=sorted(comparison.metrics[name])
+    )
+
+
+def _equivalence(t, r, variance, table):
+    scale = float(np.mean(np.abs(r)))
+    if scale == 0:
+        return Measured(None, "fail", "the reference is black: no relative error")
+    mse = significance.mse_interval(t - r, variance, confidence=1 - table["significance"])
+    found = significance.rmse_interval(mse)
+    relative = significance.interval(found.estimate / scale, found.standard_error / scale)
+    relative = significance.Interval(
+        relative.estimate, relative.standard_error, found.low / scale, found.high / scale, mse.confidence
+    )
+    result = significance.equivalence_test(relative, tolerance=table["relative_rmse"])
+    return Measured(
+        relative.estimate,
+        result.outcome,
+        f"{100 * mse.confidence:g} % interval {relative.low:.2e} to {relative.high:.2e}",
+    )

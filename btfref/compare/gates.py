@@ -1,0 +1,155 @@
+"""Gates: measured numbers against the limits of ``tolerances.toml``."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from btfref.compare.tolerances import gate_table, limits
+from btfref.errors import InputError
+
+
+@dataclass(frozen=True)
+class GateResult:
+    """One limit applied to one number.
+
+    Parameters
+    ----------
+    name : str
+        Gate and entry, ``"image.noise_free.p999"``.
+    passed : bool
+    value : float or None
+        None when nothing was measured.
+    limit : float
+        Upper limit, or lower limit when the entry begins with ``min_``.
+    reason : str
+        Why the limit is what it is.
+    outcome : {"pass", "fail", "inconclusive", "empty"}
+        ``empty``: no pixel of the class, and the gate says that this may be.
+    pixel_class : str
+        Class judged, empty for gates that are not about pixels.
+    detail : str
+        What a failure, or an undecided test, needs as explanation.
+    """
+
+    name: str
+    passed: bool
+    value: float | None
+    limit: float
+    reason: str
+    outcome: str = "pass"
+    pixel_class: str = ""
+    detail: str = ""
+
+    @property
+    def gate(self):
+        """The gate's key, ``"image.noise_free"``."""
+        return self.name.rpartition(".")[0]
+
+    @property
+    def entry(self):
+        """The entry within the gate, ``"p999"``."""
+        return self.name.rpartition(".")[2]
+
+    def to_dict(self):
+        """JSON-able form."""
+        return {
+            "name": self.name,
+            "passed": self.passed,
+            "outcome": self.outcome,
+            "value": self.value,
+            "limit": self.limit,
+            "class": self.pixel_class,
+            "reason": self.reason,
+            "detail": self.detail,
+        }
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A number with an outcome already decided by a test, or with the reason why there is no number.
+
+    Parameters
+    ----------
+    value : float or None
+    outcome : {"pass", "fail", "inconclusive", "empty"} or None
+        None leaves the decision to the limit.
+    detail : str
+    """
+
+    value: float | None
+    outcome: str | None = None
+    detail: str = ""
+
+
+def judge(key, measured, *, pixel_class=""):
+    """Apply every limit of a gate.
+
+    Parameters
+    ----------
+    key : str
+        Gate in ``tolerances.toml``.
+    measured : dict of str to float or Measured
+        One number for every limit, under the limit's name without ``min_``. A number that is missing, None or
+        NaN fails its gate: what was not measured is not right.
+    pixel_class : str, optional
+        Recorded in the results.
+
+    Returns
+    -------
+    list of GateResult
+        In the order of the file, at least one.
+
+    Raises
+    ------
+    InputError
+        Unknown gate, a gate without limits, or a measured name that the gate does not know.
+    """
+    table = gate_table(key)
+    wanted = limits(table)
+    if not wanted:
+        raise InputError("gate holds no limit", file="tolerances.toml", field=key)
+    names = {entry: entry.removeprefix("min_") for entry in wanted}
+    unknown = sorted(set(measured) - set(names.values()))
+    if unknown:
+        raise InputError(
+            "measured what the gate does not limit", field=key, got=unknown, expected=list(names.values())
+        )
+    return [
+        _apply(f"{key}.{entry}", measured.get(names[entry]), limit, table["reason"], pixel_class)
+        for entry, limit in wanted.items()
+    ]
+
+
+def missing_reference(key, what):
+    """The results of a gate whose reference is not there: failures.
+
+    Parameters
+    ----------
+    key : str
+        Gate in ``tolerances.toml``.
+    what : str
+        What is missing, for the reader.
+
+    Returns
+    -------
+    list of GateResult
+    """
+    names = [entry.removeprefix("min_") for entry in limits(gate_table(key))]
+    return judge(key, dict.fromkeys(names, Measured(None, "fail", f"missing reference: {what}")))
+
+
+def _apply(name, measured, limit, reason, pixel_class):
+    if not isinstance(measured, Measured):
+        measured = Measured(measured)
+    value = None if measured.value is None else float(measured.value)
+    outcome, detail = measured.outcome, measured.detail
+    lower = name.rpartition(".")[2].startswith("min_")
+    if outcome is None:
+        if value is None or math.isnan(value):
+            outcome, detail = "fail", detail or "not measured"
+        else:
+            outcome = "pass" if (value >= limit if lower else value <= limit) else "fail"
+            if outcome == "fail" and not detail:
+                detail = f"{value:.3g} is {'below' if lower else 'above'} {limit:g}"
+    return GateResult(name, outcome in ("pass", "empty"), value, limit, reason, outcome, pixel_class, detail)

@@ -1,0 +1,218 @@
+"""Errors of linear radiance between a test and a reference, in float64.
+
+Every function takes the test first and the reference second, arrays of one shape, and averages over all
+entries.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from btfref.errors import InputError
+
+#: Added to the squared reference in relMSE: (test - reference)² / (reference² + ε).
+RELMSE_EPSILON = 1e-2
+#: Added to the denominator of SMAPE, so that two black pixels differ by 0.
+SMAPE_EPSILON = 1e-6
+#: The relative error's denominator is at least this times the largest reference value.
+FLOOR = 1e-3
+
+#: Name → percentile of the relative error.
+PERCENTILES = {"p50": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
+
+
+def paired(test, reference):
+    """Both arrays as float64 after the check that they have one shape and are not empty.
+
+    Raises
+    ------
+    InputError
+        Different shapes, or nothing to compare.
+    """
+    test, reference = np.asarray(test), np.asarray(reference)
+    if test.shape != reference.shape:
+        raise InputError(
+            "test and reference differ in shape", field="shape", got=test.shape, expected=reference.shape
+        )
+    if test.size == 0:
+        raise InputError("nothing to compare", field="shape", got=test.shape)
+    return test.astype(np.float64), reference.astype(np.float64)
+
+
+def bias(test, reference):
+    """Mean of test - reference, in the unit of the input."""
+    t, r = paired(test, reference)
+    return float(np.mean(t - r))
+
+
+def mae(test, reference):
+    """Mean absolute error, in the unit of the input."""
+    t, r = paired(test, reference)
+    return float(np.mean(np.abs(t - r)))
+
+
+def rmse(test, reference):
+    """Root of the mean squared error, in the unit of the input."""
+    t, r = paired(test, reference)
+    return float(np.sqrt(np.mean((t - r) ** 2)))
+
+
+def nrmse(test, reference):
+    """RMSE divided by the mean absolute reference; against black, infinite for an error and 0 for none."""
+    return _ratio(rmse(test, reference), float(np.mean(np.abs(paired(test, reference)[1]))))
+
+
+def bias_fraction(test, reference):
+    """Absolute bias divided by the mean absolute reference."""
+    return _ratio(abs(bias(test, reference)), float(np.mean(np.abs(paired(test, reference)[1]))))
+
+
+def relmse(test, reference, *, epsilon=RELMSE_EPSILON):
+    """Relative mean squared error, mean of (t - r)² / (r² + ε).
+
+    Parameters
+    ----------
+    test, reference : array
+        Radiance.
+    epsilon : float, optional
+        In squared units of the input. Projects differ in this constant and in its place: quote it with
+        the number.
+
+    Returns
+    -------
+    float
+    """
+    t, r = paired(test, reference)
+    return float(np.mean((t - r) ** 2 / (r**2 + epsilon)))
+
+
+def smape(test, reference, *, epsilon=SMAPE_EPSILON):
+    """Symmetric mean absolute percentage error in [0, 2], mean of 2|t - r| / (|t| + |r| + ε)."""
+    t, r = paired(test, reference)
+    return float(np.mean(2 * np.abs(t - r) / (np.abs(t) + np.abs(r) + epsilon)))
+
+
+def psnr(test, reference, *, peak):
+    """Peak signal-to-noise ratio in dB, 20 log10(peak / RMSE); infinite for equal input.
+
+    Parameters
+    ----------
+    test, reference : array
+        Radiance.
+    peak : float
+        The signal's largest value. There is no usual one for radiance: quote it with the number.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    InputError
+        `peak` is not positive.
+    """
+    if not peak > 0:
+        raise InputError("the peak of a PSNR must be positive", field="peak", got=peak)
+    error = rmse(test, reference)
+    return float("inf") if error == 0 else float(20 * np.log10(peak / error))
+
+
+def relative_error(test, reference, *, floor=FLOOR, largest=None):
+    """Relative error |t - r| / max(|r|, floor · largest), per entry.
+
+    Parameters
+    ----------
+    test, reference : array
+        Radiance.
+    floor : float, optional
+        Fraction of `largest` below which an error counts as absolute.
+    largest : float, optional
+        Default: the largest absolute reference value.
+
+    Returns
+    -------
+    float64 array
+        Same shape. Infinite where an error stands against a reference that is black everywhere.
+    """
+    t, r = paired(test, reference)
+    largest = float(np.max(np.abs(r))) if largest is None else float(largest)
+    error, scale = np.abs(t - r), np.maximum(np.abs(r), floor * largest)
+    return np.where(
+        scale > 0,
+        error / np.where(scale > 0, scale, 1.0),
+        np.where(error > 0, np.inf, 0.0),
+    )
+
+
+def percentiles(error):
+    """Percentiles p50, p99, p999 and max of an error: the smallest entry with that share at or below it.
+
+    Parameters
+    ----------
+    error : array
+        Not empty.
+
+    Returns
+    -------
+    dict of str to float
+        No interpolation between entries: with fewer than 1000 entries p999 is the maximum.
+    """
+    ordered = np.sort(np.asarray(error, np.float64), axis=None)
+    if ordered.size == 0:
+        raise InputError("no entries", field="error", got=ordered.shape)
+    rank = [max(int(np.ceil(ordered.size * share / 100 - 1e-9)), 1) - 1 for share in PERCENTILES.values()]
+    return {name: float(ordered[i]) for name, i in zip(PERCENTILES, rank, strict=True)}
+
+
+def ssim_map(test, reference, *, data_range=1.0):
+    """Structural similarity per pixel and channel (Wang, Bovik, Sheikh and Simoncelli 2004, eq. 13).
+
+    Gaussian window of 11 × 11 pixels with a standard deviation of 1.5, K1 = 0.01, K2 = 0.03, population
+    variances.
+
+    Parameters
+    ----------
+    test, reference : (H, W, C) array
+        Made for display-encoded values, not for radiance.
+    data_range : float, optional
+        Range of the values.
+
+    Returns
+    -------
+    (H, W, C) float64 array
+        At most 1. The five pixels along each border see a mirrored picture.
+
+    Raises
+    ------
+    InputError
+        Shapes differ or are not (H, W, C).
+    """
+    t, r = paired(test, reference)
+    if t.ndim != 3:
+        raise InputError("SSIM needs a picture", field="shape", got=t.shape, expected="(H, W, C)")
+    c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
+    mean_t, mean_r = _window_mean(t), _window_mean(r)
+    var_t, var_r = _window_mean(t * t) - mean_t**2, _window_mean(r * r) - mean_r**2
+    covariance = _window_mean(t * r) - mean_t * mean_r
+    return ((2 * mean_t * mean_r + c1) * (2 * covariance + c2)) / (
+        (mean_t**2 + mean_r**2 + c1) * (var_t + var_r + c2)
+    )
+
+
+def _window_mean(x):
+    """Mean under SSIM's Gaussian window along the first two axes, mirrored at the borders."""
+    offsets = np.arange(-5, 6)
+    weights = np.exp(-0.5 * (offsets / 1.5) ** 2)
+    weights /= weights.sum()
+    for axis in (0, 1):
+        size = x.shape[axis]
+        index = (np.arange(size)[:, None] + offsets) % (2 * size)
+        index = np.where(index < size, index, 2 * size - 1 - index)
+        x = sum(w * np.take(x, index[:, k], axis=axis) for k, w in enumerate(weights))
+    return x
+
+
+def _ratio(value, scale):
+    if scale > 0:
+        return value / scale
+    return float("inf") if value > 0 else 0.0
