@@ -1,0 +1,97 @@
+"""Clustering of vectors by reconstruction error (local PCA)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+#: The iteration stops when the total error falls by less than this share.
+RELATIVE_PROGRESS = 1e-4
+MAXIMUM_ITERATIONS = 60
+LLOYD_ITERATIONS = 8
+
+
+def spread_seeds(points, n_clusters, rng):
+    """Indices of initial centres by k-means++ (Arthur and Vassilvitskii 2007)."""
+    chosen = [int(rng.integers(len(points)))]
+    distance = ((points - points[chosen[0]]) ** 2).sum(1)
+    for _ in range(n_clusters - 1):
+        total = distance.sum()
+        # All remaining points coincide with a centre: any choice is as good, the first keeps it deterministic.
+        following = int(rng.choice(len(points), p=distance / total)) if total > 0 else 0
+        chosen.append(following)
+        distance = np.minimum(distance, ((points - points[following]) ** 2).sum(1))
+    return np.array(chosen)
+
+
+def assign_nearest(points, centres):
+    """Index of the nearest centre of each point; ties go to the lowest index."""
+    return np.argmin((centres**2).sum(1) - 2 * points @ centres.T, 1)
+
+
+def local_pca(points, n_clusters, n_components, rng):
+    """Partition points such that each cluster's affine subspace reconstructs its members best.
+
+    Alternates assignment to the cluster whose mean and leading components leave the smallest squared error with the
+    PCA of each cluster (Kambhatla and Leen 1997), from k-means centres. Deterministic given ``rng``: ties go to the
+    lowest index, an empty cluster takes over the worst reconstructed point.
+
+    Parameters
+    ----------
+    points : ndarray of float64, shape (n, r)
+    n_clusters, n_components : int
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    labels : ndarray of int64, shape (n,)
+    iterations : int
+    """
+    n, dimension = points.shape
+    n_used = min(n_clusters, n)
+    rank = min(n_components, dimension)
+    centres = points[spread_seeds(points, n_used, rng)]
+    for _ in range(LLOYD_ITERATIONS):
+        labels = assign_nearest(points, centres)
+        count = np.bincount(labels, minlength=n_used)
+        # An abandoned centre stays where it is.
+        sums = np.zeros_like(centres)
+        np.add.at(sums, labels, points)
+        centres = np.where(count[:, None] > 0, sums / np.maximum(count, 1)[:, None], centres)
+    labels = assign_nearest(points, centres)
+    best, best_error, previous = labels, np.inf, np.inf
+    iteration = 0
+    for iteration in range(1, MAXIMUM_ITERATIONS + 1):  # noqa: B007
+        error = reconstruction_errors(points, labels, n_used, rank)
+        current = error[np.arange(n), labels]
+        total = current.sum()
+        if total < best_error:
+            best, best_error = labels, total
+        if previous - total <= RELATIVE_PROGRESS * previous and np.isfinite(previous):
+            break
+        previous = total
+        labels = np.argmin(error, 1)
+        empty = np.setdiff1d(np.arange(n_used), labels)
+        if len(empty):
+            worst = np.argsort(-error[np.arange(n), labels], kind="stable")[: len(empty)]
+            labels[worst] = empty
+    return best, iteration
+
+
+def reconstruction_errors(points, labels, n_clusters, rank):
+    """Squared error of every point in every cluster's affine subspace, shape (n, n_clusters)."""
+    n, dimension = points.shape
+    squared = (points**2).sum(1)
+    error = np.full((n, n_clusters), np.inf)
+    for k in range(n_clusters):
+        members = points[labels == k]
+        if not len(members):
+            continue
+        mean = members.mean(0)
+        centred = members - mean
+        value, vector = np.linalg.eigh(centred.T @ centred)
+        axes = vector[:, ::-1][:, : min(rank, dimension)]
+        # Directions without variance are no axes: a single member must not span anything.
+        axes = axes * (value[::-1][: axes.shape[1]] > 1e-12 * max(value[-1], 1e-300))
+        projection = points @ axes - mean @ axes
+        error[:, k] = squared - 2 * points @ mean + mean @ mean - (projection**2).sum(1)
+    return np.maximum(error, 0)

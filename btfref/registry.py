@@ -1,0 +1,111 @@
+"""The methods: one row each, as strings, so that nothing is imported before it is used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+
+from btfref.errors import InputError
+
+#: Third parties add rows with entry points of this group; each names an object of type :class:`Method`.
+ENTRY_POINT_GROUP = "btfref.representations"
+
+
+@dataclass(frozen=True)
+class Method:
+    """Where the parts of a method are.
+
+    Parameters
+    ----------
+    key : str
+        Name on the command line, in files and in shaders.
+    title, paper : str
+        For people.
+    module : str
+        Module with ``Representation`` (the class), ``fit`` and ``PRESETS``.
+    plugin : str
+        Module with ``Evaluator``, the Dr.Jit port.
+    shader : str
+        GLSL file with ``btf_eval``, relative to a shader directory.
+    shader_package : str
+        Package that holds the shader directory ("" for btfref's own).
+    """
+
+    key: str
+    title: str
+    paper: str
+    module: str
+    plugin: str
+    shader: str
+    shader_package: str = ""
+
+    @property
+    def representation(self):
+        """The class that holds the method's maps and evaluates them in float64."""
+        return import_module(self.module).Representation
+
+    @property
+    def fit(self):
+        """``fit(btf, *, seed=0, progress=None, **params) -> Representation``."""
+        return import_module(self.module).fit
+
+    @property
+    def presets(self):
+        """Named settings of ``fit``; "paper" has the settings of the method's paper."""
+        return import_module(self.module).PRESETS
+
+
+def _row(key, title, paper):
+    return Method(
+        key,
+        title,
+        paper,
+        module=f"btfref.representations.{key}",
+        plugin=f"mitsuba_plugins.{key}",
+        shader=f"representations/{key}.glsl",
+    )
+
+
+_ROWS = (
+    _row("raw", "Tabulated BTF, interpolated", "Dana et al. 1999"),
+    _row("svd", "Global truncated singular value decomposition", "Koudelka et al. 2003"),
+    _row("lpca", "Local PCA (eigen-BRDFs per cluster)", "Müller, Meseth, Klein 2003 and 2004"),
+)
+
+
+@cache
+def methods():
+    """All methods by key, those of installed third-party packages included.
+
+    Returns
+    -------
+    dict of str to Method
+
+    Raises
+    ------
+    InputError
+        When two packages claim one key.
+    """
+    rows = {row.key: row for row in _ROWS}
+    for point in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda p: (p.name, p.value)):
+        row = point.load()
+        if row.key in rows:
+            raise InputError("two packages provide one method", field=ENTRY_POINT_GROUP, got=f"{row.key} ({point.value})")
+        rows[row.key] = row
+    return rows
+
+
+def method(key, *, file=None):
+    """The method ``key``.
+
+    Raises
+    ------
+    InputError
+        When there is none.
+    """
+    rows = methods()
+    if key not in rows:
+        raise InputError("unknown method", file=file, got=repr(key), expected=f"one of {', '.join(rows)}")
+    return rows[key]

@@ -1,0 +1,232 @@
+"""Representations as multi-part OpenEXR files: one part per map, the manifest as an attribute.
+
+A part's channels are the last axis of its map; the other axes fold into the image: trailing axes into columns
+while they fit 8192, the rest into rows. The manifest (JSON, attribute ``btfref`` of the first part) keeps shapes
+and types, so that the maps come back exactly.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from btfref.conventions import SCHEMA_VERSION
+from btfref.errors import InputError
+from btfref.registry import method
+
+ATTRIBUTE = "btfref"
+MAXIMUM_WIDTH = 8192
+_MAGIC = bytes((0x76, 0x2F, 0x31, 0x01))
+_TYPES = ("float16", "float32", "uint32")
+
+
+def save(representation, path):
+    """Write a representation to ``path`` atomically.
+
+    Parameters
+    ----------
+    representation : Representation
+    path : path-like
+        By convention ``NAME.KEY.exr``.
+
+    Raises
+    ------
+    InputError
+        When the directory does not exist or cannot be written.
+    """
+    import OpenEXR
+
+    path = Path(path)
+    arrays = {name: np.asarray(array) for name, array in representation.arrays().items()}
+    manifest = {
+        "schema": SCHEMA_VERSION,
+        "kind": "representation",
+        "meta": representation.meta,
+        "arrays": {name: {"shape": list(a.shape), "dtype": a.dtype.name} for name, a in arrays.items()},
+    }
+    images = {name: array.reshape(*_image_size(array.shape), array.shape[-1]) for name, array in arrays.items()}
+    display = (
+        np.zeros(2, np.int32),
+        np.array([max(i.shape[1] for i in images.values()) - 1, max(i.shape[0] for i in images.values()) - 1], np.int32),
+    )
+    parts = []
+    for name, image in images.items():
+        if image.dtype.name not in _TYPES:
+            raise TypeError(f"map {name} must be one of {_TYPES}, got {image.dtype}")
+        header = {
+            "name": name,
+            "type": OpenEXR.scanlineimage,
+            "compression": OpenEXR.ZIP_COMPRESSION,
+            "displayWindow": display,
+            "dataWindow": (np.zeros(2, np.int32), np.array([image.shape[1] - 1, image.shape[0] - 1], np.int32)),
+        }
+        if not parts:
+            header[ATTRIBUTE] = json.dumps(manifest, sort_keys=True)
+        channels = {
+            channel: np.ascontiguousarray(image[..., i]) for i, channel in enumerate(_channel_names(image.shape[-1]))
+        }
+        parts.append(OpenEXR.Part(header, channels, name))
+    if not path.parent.is_dir():
+        raise InputError("the directory does not exist", file=path, got=str(path.parent))
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")
+    os.close(handle)
+    try:
+        OpenEXR.File(parts).write(temporary)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def load(path):
+    """Read a representation.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    Representation
+
+    Raises
+    ------
+    InputError
+        When the file is missing, empty, not an OpenEXR file, truncated, written by a newer schema, of an unknown
+        method, or holds a value that is not finite.
+    """
+    manifest, parts = _open(path, header_only=False)
+    arrays = {}
+    for name, entry in manifest["arrays"].items():
+        if name not in parts:
+            raise InputError("a map is missing", file=path, field=name)
+        arrays[name] = _read_map(path, name, entry, parts[name])
+    meta = manifest["meta"]
+    return method(meta["method"], file=path).representation.from_arrays(arrays, meta)
+
+
+def read_info(path):
+    """Facts about a representation, from its headers only.
+
+    Returns
+    -------
+    dict
+        ``kind``, ``method``, ``shape`` [views, lights, rows, columns, 3] of the BTF it stands for, ``directions``,
+        ``maps``, ``payload_bytes`` (the maps alone, counted as the papers count: no direction tables, an index map
+        at the width its codebook needs), ``file_bytes``, ``raw_bytes`` (the BTF as 32-bit floats), ``ratio``,
+        ``parameters``, ``parent``, ``versions``.
+    """
+    manifest, parts = _open(path, header_only=True)
+    meta, maps = manifest["meta"], manifest["arrays"]
+    for name in maps:
+        if name not in parts:
+            raise InputError("a map is missing", file=path, field=name)
+    views, lights = meta["views"], meta["lights"]
+    shape = [views["count"], lights["count"], *meta["texels"], 3]
+    payload = payload_bytes({name: (entry["shape"], entry["dtype"]) for name, entry in maps.items()}, meta)
+    raw = 4 * int(np.prod(shape, dtype=np.int64))
+    return {
+        "kind": "representation",
+        "method": meta["method"],
+        "shape": shape,
+        "directions": {"views": views, "lights": lights},
+        "filter_type": meta["filter_type"],
+        "maps": maps,
+        "payload_bytes": payload,
+        "file_bytes": Path(path).stat().st_size,
+        "raw_bytes": raw,
+        "ratio": raw / payload,
+        "parameters": meta["parameters"],
+        "parent": meta["parent"],
+        "versions": meta["versions"],
+    }
+
+
+def payload_bytes(maps, meta):
+    """Bytes of the maps alone.
+
+    Parameters
+    ----------
+    maps : dict of str to (shape, dtype name)
+    meta : dict
+        ``index_bytes`` maps the name of an index map to the bytes that one index needs.
+    """
+    total = 0
+    for name, (shape, dtype) in maps.items():
+        if name.startswith(("view_", "light_")):
+            continue
+        width = meta.get("index_bytes", {}).get(name, np.dtype(dtype).itemsize)
+        total += width * int(np.prod(shape, dtype=np.int64))
+    return total
+
+
+def _image_size(shape):
+    """Rows and columns of the image that holds a map: trailing axes fold into columns while they fit."""
+    spatial = [int(n) for n in shape[:-1]] or [1]
+    width = spatial.pop()
+    while spatial and width * spatial[-1] <= MAXIMUM_WIDTH:
+        width *= spatial.pop()
+    return int(np.prod(spatial, dtype=np.int64)), width
+
+
+def _channel_names(n):
+    # A viewer shows "R, G, B" as colour and "Y" as grey; EXR sorts channels by name, hence the padded numbers.
+    return {1: ["Y"], 3: ["R", "G", "B"]}.get(n, [f"c{i:04d}" for i in range(n)])
+
+
+def _open(path, *, header_only):
+    """Manifest and parts by name, after every check that needs no pixels."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError("no such file" if not path.exists() else "not a file", file=path)
+    if path.stat().st_size == 0:
+        raise InputError("the file is empty", file=path)
+    with path.open("rb") as stream:
+        magic = stream.read(4)
+    if magic != _MAGIC:
+        raise InputError("not an OpenEXR file", file=path, field="magic number", got=magic.hex(), expected=_MAGIC.hex())
+    import OpenEXR
+
+    try:
+        # Channels stay apart: RGB grouping would reorder those of maps with many channels.
+        file = OpenEXR.File(str(path), separate_channels=True, header_only=header_only)
+        parts = {part.header.get("name", ""): part for part in file.parts}
+        text = file.parts[0].header.get(ATTRIBUTE)
+    except (RuntimeError, ValueError, OSError, IndexError, MemoryError) as error:
+        raise InputError(f"damaged or truncated OpenEXR file: {error}", file=path) from error
+    if text is None:
+        raise InputError("not a btfref representation", file=path, field=ATTRIBUTE, expected="a manifest attribute")
+    try:
+        manifest = json.loads(text)
+        schema = manifest["schema"]
+        manifest["meta"]["method"], manifest["arrays"].items()
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError("damaged manifest", file=path, field=ATTRIBUTE, got=repr(error)) from error
+    if schema > SCHEMA_VERSION:
+        raise InputError("written by a newer btfref", file=path, field="schema", got=schema, expected=f"≤ {SCHEMA_VERSION}")
+    return manifest, parts
+
+
+def _read_map(path, name, entry, part):
+    shape = tuple(entry["shape"])
+    result = np.zeros((*_image_size(shape), shape[-1]), entry["dtype"])
+    for i, channel in enumerate(_channel_names(shape[-1])):
+        pixels = part.channels[channel].pixels if channel in part.channels else None
+        if pixels is None or pixels.shape != result.shape[:2] or pixels.dtype != result.dtype:
+            got = "nothing" if pixels is None else f"{pixels.dtype} {pixels.shape}"
+            raise InputError(
+                "a map is damaged",
+                file=path,
+                field=f"{name}.{channel}",
+                got=got,
+                expected=f"{result.dtype} {result.shape[:2]}",
+            )
+        result[..., i] = pixels
+    if result.dtype.kind == "f" and not np.isfinite(result).all():
+        raise InputError("a map holds a value that is not finite", file=path, field=name)
+    return result.reshape(shape)

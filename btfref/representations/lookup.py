@@ -1,0 +1,137 @@
+"""What every tabulated method shares: stencils of directions and texels, validity, chunking, packing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from btfref import conventions
+from btfref.errors import InputError
+from btfref.numerics import interpolation
+
+#: Points evaluated at a time: bounds the memory of the gathered neighbourhoods.
+CHUNK = 1 << 14
+
+
+@dataclass(frozen=True)
+class Stencils:
+    """Neighbours of N lookups: indices and weights of texels (N, T), views (N, V) and lights (N, L)."""
+
+    texel: np.ndarray
+    texel_weight: np.ndarray
+    view: np.ndarray
+    view_weight: np.ndarray
+    light: np.ndarray
+    light_weight: np.ndarray
+
+    @property
+    def pair_weight(self):
+        """Weights of the (view, light) pairs, shape (N, V, L)."""
+        return self.view_weight[:, :, None] * self.light_weight[:, None, :]
+
+
+def evaluate_tabulated(representation, kernel, uv, w_light, w_view):
+    """Evaluate a method that interpolates tables over measured directions and texels.
+
+    Parameters
+    ----------
+    representation : Representation
+        Its arrays hold the direction tables, its meta ``texels`` and ``filter_type``.
+    kernel : callable
+        ``Stencils -> (N, 3)`` float64.
+    uv, w_light, w_view : array_like, shape (..., 2), (..., 3), (..., 3)
+
+    Returns
+    -------
+    ndarray of float64, shape (..., 3)
+    """
+    arrays, meta = representation.arrays(), representation.meta
+    views, lights = interpolation.from_arrays(arrays, "view"), interpolation.from_arrays(arrays, "light")
+    uv, w_light, w_view = (np.asarray(a, float) for a in (uv, w_light, w_view))
+    shape = np.broadcast_shapes(uv.shape[:-1], w_light.shape[:-1], w_view.shape[:-1])
+    uv, w_light, w_view = (np.broadcast_to(a, (*shape, a.shape[-1])).reshape(-1, a.shape[-1]) for a in (uv, w_light, w_view))
+    result = np.zeros((len(uv), 3))
+    for start in range(0, len(uv), CHUNK):
+        part = slice(start, start + CHUNK)
+        valid = conventions.valid_directions(w_light[part]) & conventions.valid_directions(w_view[part])
+        if not valid.any():
+            continue
+        texel, texel_weight = conventions.texel_stencil(uv[part][valid], meta["texels"], meta["filter_type"])
+        view, view_weight = views.stencil(w_view[part][valid])
+        light, light_weight = lights.stencil(w_light[part][valid], hold=False)
+        stencils = Stencils(texel, texel_weight, view, view_weight, light, light_weight)
+        result[part][valid] = kernel(stencils)
+    return result.reshape(*shape, 3)
+
+
+def direction_arrays(views, lights):
+    """The direction tables of two sets, as every representation stores them."""
+    result = {}
+    for prefix, directions in (("view", views), ("light", lights)):
+        result[f"{prefix}_directions"] = directions.vectors.astype(np.float32)
+        result |= directions.interpolation.arrays(prefix)
+    return result
+
+
+def packed(array):
+    """``array`` with its last axis padded by zeros to a multiple of 4."""
+    missing = -array.shape[-1] % 4
+    if not missing:
+        return np.ascontiguousarray(array)
+    return np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, missing)])
+
+
+def packed_arrays(arrays, **tables):
+    """Port layout of ``arrays`` with the ``tables`` that are laid out anew in place of their namesakes."""
+    return {name: packed(tables.get(name, array)) for name, array in arrays.items()}
+
+
+def base_meta(method, btf, parameters, *, filter_type="bilinear"):
+    """The meta that every fit starts from."""
+    from btfref.versions import versions
+
+    return {
+        "method": method,
+        "texels": list(btf.values.shape[2:4]),
+        "views": {"name": btf.views.name, "count": len(btf.views)},
+        "lights": {"name": btf.lights.name, "count": len(btf.lights)},
+        "filter_type": filter_type,
+        "parameters": parameters,
+        "parent": dict(btf.attributes),
+        "versions": versions(),
+        "constants": {},
+    }
+
+
+#: Storage types of float maps by name.
+STORAGE = {"half": np.float16, "float": np.float32}
+
+
+def stored(name, array, storage):
+    """``array`` in the type that ``storage`` ("half" or "float") names.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, or a value beyond the type's range: never a silent infinity.
+    """
+    if storage not in STORAGE:
+        raise InputError("unknown storage", field="storage", got=repr(storage), expected=" or ".join(STORAGE))
+    limit = float(np.finfo(STORAGE[storage]).max)
+    peak = float(np.abs(array).max(initial=0))
+    if not peak <= limit:
+        raise InputError(f"values do not fit {storage} floats", field=name, got=f"{peak:.4g}", expected=f"at most {limit:.4g}")
+    return array.astype(STORAGE[storage])
+
+
+def positive_integer(name, value):
+    """``value`` as an int of at least 1.
+
+    Raises
+    ------
+    InputError
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise InputError("a parameter is out of range", field=name, got=repr(value), expected="an integer of at least 1")
+    return int(value)

@@ -1,0 +1,68 @@
+"""The tabulated BTF itself, interpolated over directions and texels: what every method approximates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from btfref import conventions
+from btfref.representations.lookup import base_meta, direction_arrays, evaluate_tabulated, packed_arrays
+
+PRESETS = {"paper": {}}
+
+
+@dataclass(frozen=True)
+class Representation:
+    """Table ``values`` [row, column, view, light, 3] and the directions it is sampled at."""
+
+    maps: dict
+    meta: dict
+
+    def evaluate(self, uv, w_light, w_view, *, lod=0.0):
+        """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored."""
+        values = self.maps["values"]
+        table = values.reshape(-1, *values.shape[2:])
+
+        def kernel(s):
+            index = (s.texel[:, :, None, None], s.view[:, None, :, None], s.light[:, None, None, :])
+            return np.einsum("nt,nv,nl,ntvlc->nc", s.texel_weight, s.view_weight, s.light_weight, table[index].astype(float))
+
+        return evaluate_tabulated(self, kernel, uv, w_light, w_view)
+
+    def arrays(self):
+        """``values`` and the direction tables."""
+        return self.maps
+
+    def port_arrays(self):
+        """``values`` [row, column, view, light, 4]."""
+        return packed_arrays(self.maps)
+
+    def sampling_tables(self):
+        """One group: the mean over all texels."""
+        values = self.maps["values"]
+        # Texel rows are averaged one by one: the float64 copy stays small.
+        mean = np.mean([row.mean(0, dtype=np.float64) for row in values], 0)
+        return np.zeros(values.shape[:2], np.uint32), conventions.luminance(mean)[None]
+
+    @classmethod
+    def from_arrays(cls, arrays, meta):
+        return cls(arrays, meta)
+
+
+def fit(btf, *, seed=0, progress=None, filter_type="bilinear"):
+    """The table of ``btf`` in the layout of lookups.
+
+    Parameters
+    ----------
+    btf : SampledBTF
+    seed : int
+        Unused: nothing is random.
+    progress : callable, optional
+        Unused: the copy takes no noticeable time.
+    filter_type : {"bilinear", "nearest"}
+        Texel filter that :meth:`Representation.evaluate` and the ports use.
+    """
+    values = np.ascontiguousarray(np.transpose(btf.values, (2, 3, 0, 1, 4)))
+    meta = base_meta("raw", btf, {}, filter_type=filter_type)
+    return Representation({"values": values, **direction_arrays(btf.views, btf.lights)}, meta)
