@@ -126,7 +126,9 @@ def probe(code, *arguments, environment=None):
             return {"works": True, **json.loads(done.stdout.strip().splitlines()[-1])}
         except (IndexError, ValueError):
             return {"works": False, "error": "unreadable answer"}
-    said = [line.strip() for line in done.stderr.splitlines() if line.strip()]
+    # Of chained exceptions the first is the cause.
+    cause = done.stderr.split("\nDuring handling of the above exception")[0]
+    said = [line.strip() for line in cause.splitlines() if line.strip()]
     if done.returncode < 0:
         return {"works": False, "error": f"the process died of signal {-done.returncode}"}
     return {"works": False, "error": said[-1] if said else f"exit status {done.returncode}"}
@@ -217,6 +219,7 @@ def examine():
         "gl": gl,
         "gpu": gpu,
         "programs": programs,
+        "missing": [requirement.name for requirement in system.missing()],
     }
     return Examination(tuple(_checks(facts)), facts)
 
@@ -228,6 +231,7 @@ def _llvm_environment(llvm):
 def _checks(facts):
     """The lines for a reader, from the facts."""
     yield from _version_checks(facts["versions"])
+    yield from _library_checks(facts["missing"])
     yield from _llvm_checks(facts["llvm"])
     yield from _variant_checks(facts["variants"], facts["gpu"])
     yield from _gl_checks(facts["gl"])
@@ -246,8 +250,19 @@ def _version_checks(installed):
             yield Check("versions", name, "ok", version)
 
 
+def _library_checks(missing):
+    for requirement in system.REQUIREMENTS:
+        # LLVM has its own lines.
+        if not requirement.for_tests and requirement is not system.LLVM:
+            if requirement.name in missing:
+                mend = system.mend_command([requirement])
+                yield Check("system libraries", requirement.name, "missing", "not found", mend)
+            else:
+                yield Check("system libraries", requirement.name, "ok", "found")
+
+
 def _llvm_checks(llvm):
-    mend = system.mend_command([system.REQUIREMENTS[0]])
+    mend = system.mend_command([system.LLVM])
     if llvm["chosen"] is None:
         yield Check("Mitsuba", "LLVM", "missing", llvm["reason"], mend)
     else:
@@ -267,7 +282,7 @@ def _variant_checks(variants, gpu):
         elif result["works"]:
             yield Check("Mitsuba", name, "missing", "renders black or NaN", "reinstall mitsuba and drjit")
         elif needed:
-            mend = "see the LLVM line" if name.startswith("llvm") else "reinstall mitsuba and drjit"
+            mend = "mend the system libraries above first; if none is missing, reinstall mitsuba and drjit"
             yield Check("Mitsuba", name, "missing", result["error"], mend)
         elif gpu:
             mend = "update the NVIDIA driver; until then the llvm variant is used"
@@ -279,7 +294,7 @@ def _variant_checks(variants, gpu):
 
 def _gl_checks(gl):
     if not gl["works"]:
-        mend = system.mend_command([r for r in system.REQUIREMENTS if "GL" in r.name])
+        mend = "mend the system libraries above first; if none is missing, install the driver of your GPU"
         yield Check("OpenGL", "EGL context", "missing", gl["error"], mend)
         return
     yield Check("OpenGL", "renderer", "ok", gl["renderer"])

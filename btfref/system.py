@@ -69,10 +69,14 @@ def chromium():
     return next((path for path in map(shutil.which, names) if path), None)
 
 
+LLVM = Requirement(
+    f"LLVM {MINIMUM_LLVM} or later", (DEFAULT_LLVM_PACKAGE,), lambda: choose_llvm().path is not None
+)
+
 REQUIREMENTS = (
-    Requirement(
-        f"LLVM {MINIMUM_LLVM} or later", (DEFAULT_LLVM_PACKAGE,), lambda: choose_llvm().path is not None
-    ),
+    LLVM,
+    # Dr.Jit's extension links against it; GCC's runtime libraries of a minimal system lack it.
+    Requirement("libatomic", ("libatomic1",), lambda: _loads("libatomic.so.1")),
     Requirement("libEGL", ("libegl1",), lambda: _loads("libEGL.so.1")),
     Requirement("libGL", ("libgl1",), lambda: _loads("libGL.so.1")),
     Requirement("libGLESv2", ("libgles2",), lambda: _loads("libGLESv2.so.2")),
