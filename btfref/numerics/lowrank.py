@@ -25,7 +25,7 @@ def texel_matrix(values):
     return result.reshape(rows * columns, -1)
 
 
-def range_basis(matrix, rank, rng, *, iterations=2):
+def range_basis(matrix, rank, rng, *, iterations=1):
     """Orthonormal rows that span the dominant row space of ``matrix``, by randomized subspace iteration.
 
     Halko, Martinsson, Tropp (SIAM Review 2011), algorithm 4.4 on the transpose.

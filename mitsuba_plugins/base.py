@@ -1,0 +1,221 @@
+"""The BSDF plugin ``btf``: sampling, flags, and the translation of Mitsuba's ``wi``/``wo``.
+
+Nothing else in the project uses ``wi`` and ``wo``.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from btfref.conventions import FILTER_TYPES
+from btfref.errors import InputError
+from btfref.registry import method
+from mitsuba_plugins.guide import LightGuide
+from mitsuba_plugins.lookup import direction_table, tensor, valid_directions
+
+
+class Maps:
+    """The maps of a representation on the device, and the shared tables of an evaluator.
+
+    Attributes
+    ----------
+    tensors : dict of str to TensorXf, TensorXf16 or TensorXu
+        Port layout (last axis a multiple of 4).
+    views, lights : RingTable or TriangleTable
+    shape : tuple of int
+        Rows and columns of texels.
+    filter_type : str
+    meta : dict
+    """
+
+    def __init__(self, representation, filter_type):
+        arrays = representation.port_arrays()
+        self.meta = representation.meta
+        self.shape = tuple(self.meta["texels"])
+        self.filter_type = filter_type
+        self.views, self.lights = direction_table(arrays, "view"), direction_table(arrays, "light")
+        self.tensors = {
+            name: tensor(array) for name, array in arrays.items() if not name.startswith(("view_", "light_"))
+        }
+
+
+def uv_transform(matrix):
+    """Affine map of texture coordinates and the rotation that it gives to the local frame.
+
+    Parameters
+    ----------
+    matrix : array_like, shape (4, 4) or (3, 3)
+        Mitsuba's ``to_uv``.
+
+    Returns
+    -------
+    affine : ndarray, shape (2, 3)
+    rotation : tuple of float
+        Cosine and sine of the angle by which local directions turn about the normal to reach the texture's frame:
+        that of the rotation nearest to the linear part.
+
+    Raises
+    ------
+    InputError
+        For a mirroring or singular transform, which would make the local frame left-handed.
+    """
+    m = np.asarray(matrix, float)
+    affine = np.concatenate([m[:2, :2], m[:2, -1:]], 1)
+    if np.linalg.det(affine[:, :2]) <= 0:
+        raise InputError("the transform mirrors or is singular", field="to_uv", expected="a positive determinant")
+    c, s = affine[0, 0] + affine[1, 1], affine[1, 0] - affine[0, 1]
+    length = np.hypot(c, s)
+    return affine, ((c / length, s / length) if length > 0 else (1.0, 0.0))
+
+
+def make_bsdf():
+    """The plugin class for the current Mitsuba variant."""
+
+    class BTF(mi.BSDF):
+        """A compressed BTF.
+
+        ========== ========= ==================================================================================
+        parameter  type      meaning
+        ========== ========= ==================================================================================
+        filename   string    the representation, as written by ``btfref fit``
+        filter_type string   "bilinear" or "nearest"; default: what the file says
+        scale      float     factor of the reflectance, ≥ 0; default 1
+        to_uv      transform of the texture coordinates; its rotation also turns the local frame
+        ========== ========= ==================================================================================
+
+        Values hold the light's cosine already. The surface reflects on its front side only; wrap it in
+        ``twosided`` for both.
+        """
+
+        def __init__(self, props):
+            mi.BSDF.__init__(self, props)
+            from btfref.representations import load
+
+            self.filename = _parameter(props, "filename", None)
+            if self.filename is None:
+                raise InputError("the plugin 'btf' needs a file", field="filename")
+            representation = load(str(mi.file_resolver().resolve(str(self.filename))))
+            own = representation.meta["filter_type"]
+            self.filter_type = _parameter(props, "filter_type", own)
+            if self.filter_type not in FILTER_TYPES:
+                raise InputError(
+                    "unknown filter", field="filter_type", got=self.filter_type, expected=" or ".join(FILTER_TYPES)
+                )
+            scale = float(_parameter(props, "scale", 1.0))
+            if not (np.isfinite(scale) and scale >= 0):
+                raise InputError("the scale is out of range", field="scale", got=scale, expected="a finite value ≥ 0")
+            self.scale = mi.Float(scale)
+            affine, self.rotation = uv_transform(_matrix(_parameter(props, "to_uv", None)))
+            self.affine = affine
+            self.key = representation.meta["method"]
+            self.maps = Maps(representation, self.filter_type)
+            self.evaluator = import_module(method(self.key).plugin).Evaluator(self.maps)
+            self.guide = LightGuide(representation, self.maps.views)
+            flags = (
+                mi.BSDFFlags.GlossyReflection
+                | mi.BSDFFlags.FrontSide
+                | mi.BSDFFlags.SpatiallyVarying
+                | mi.BSDFFlags.Anisotropic
+                | mi.BSDFFlags.NonSymmetric
+            )
+            self.m_components = [flags]
+            self.m_flags = flags
+
+        def _local(self, ctx, si, wo):
+            """Texture coordinates and directions in the texture's frame."""
+            a = self.affine
+            uv = mi.Point2f(
+                a[0, 0] * si.uv.x + a[0, 1] * si.uv.y + a[0, 2], a[1, 0] * si.uv.x + a[1, 1] * si.uv.y + a[1, 2]
+            )
+            w_view, w_light = self._turn(si.wi), self._turn(wo)
+            if ctx.mode == mi.TransportMode.Importance:
+                w_view, w_light = w_light, w_view
+            return uv, w_light, w_view
+
+        def _turn(self, w, sign=1):
+            c, s = self.rotation
+            if s == 0 and c > 0:
+                return mi.Vector3f(w)
+            return mi.Vector3f(c * w.x - sign * s * w.y, sign * s * w.x + c * w.y, w.z)
+
+        @staticmethod
+        def _enabled(ctx):
+            return ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
+
+        def _evaluate(self, uv, w_light, w_view, active):
+            active = active & valid_directions(w_light) & valid_directions(w_view)
+            # Invalid lanes look up the pole: no index may leave its table.
+            up = mi.Vector3f(0, 0, 1)
+            w_light, w_view = dr.select(active, w_light, up), dr.select(active, w_view, up)
+            value = self.evaluator.evaluate(uv, w_light, w_view, active)
+            return dr.select(active, value * self.scale, 0), w_light, w_view, active
+
+        def eval(self, ctx, si, wo, active=True):
+            if not self._enabled(ctx):
+                return mi.Color3f(0)
+            return self._evaluate(*self._local(ctx, si, wo), mi.Bool(active))[0]
+
+        def pdf(self, ctx, si, wo, active=True):
+            if not self._enabled(ctx):
+                return mi.Float(0)
+            uv, w_light, w_view, active = self._guided(ctx, si, wo, mi.Bool(active))
+            return self.guide.pdf(self.guide.neighbours(uv, w_view, active), w_light, active)
+
+        def _guided(self, ctx, si, wo, active):
+            """As :meth:`_local`, for the guide: the sampled direction always plays the light."""
+            a_ctx = mi.BSDFContext(mi.TransportMode.Radiance)
+            uv, w_light, w_view = self._local(a_ctx, si, wo)
+            active = active & valid_directions(w_light) & valid_directions(w_view)
+            up = mi.Vector3f(0, 0, 1)
+            return uv, dr.select(active, w_light, up), dr.select(active, w_view, up), active
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
+
+        def sample(self, ctx, si, sample1, sample2, active=True):
+            bs = dr.zeros(mi.BSDFSample3f)
+            if not self._enabled(ctx):
+                return bs, mi.Color3f(0)
+            active = mi.Bool(active) & valid_directions(si.wi)
+            wi = dr.select(active, si.wi, mi.Vector3f(0, 0, 1))
+            uv, _, w_view, _ = self._guided(ctx, si, wi, active)
+            neighbours = self.guide.neighbours(uv, w_view, active)
+            w_light = self.guide.sample(neighbours, sample1, sample2, active)
+            bs.wo = self._turn(w_light, -1)
+            bs.eta = 1.0
+            bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
+            bs.sampled_component = 0
+            value, pdf = self.eval_pdf(ctx, si, bs.wo, active)
+            bs.pdf = pdf
+            usable = active & (pdf > 0)
+            return bs, dr.select(usable, value / pdf, 0)
+
+        def traverse(self, callback):
+            callback.put("scale", self.scale, mi.ParamFlags.Differentiable)
+            for name, values in self.maps.tensors.items():
+                integer = dr.is_integral_v(values.array)
+                flag = mi.ParamFlags.NonDifferentiable if integer else mi.ParamFlags.Differentiable
+                callback.put(name, values, flag)
+
+        def parameters_changed(self, keys):
+            self.evaluator.update(self.maps)
+
+        def to_string(self):
+            return (
+                f"BTF[filename={self.filename}, method={self.key}, filter_type={self.filter_type}, "
+                f"texels={self.maps.shape}]"
+            )
+
+    return BTF
+
+
+def _parameter(props, name, default):
+    return props[name] if name in props else default  # noqa: SIM401  (Properties has no get with default)
+
+
+def _matrix(transform):
+    return np.eye(4) if transform is None else np.asarray(transform.matrix, float)

@@ -1,0 +1,284 @@
+"""Dr.Jit ports of the shared lookups: directions, texels, and tables of direction pairs.
+
+Everything here is recorded, never executed per sample: no data-dependent Python control flow.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+#: Half floats are widened by moving their bits into those of a float32 and multiplying by 2^112, which makes up for
+#: the different exponent biases; exact for normal and subnormal values.
+HALF_SCALE = 2.0**112
+
+
+def valid_directions(w):
+    """As :func:`btfref.conventions.valid_directions`."""
+    return (w.z > 0) & (dr.squared_norm(w) < 4)
+
+
+def texel_stencil(uv, shape, filter_type):
+    """As :func:`btfref.conventions.texel_stencil`, for finite ``uv``: lists of indices and weights."""
+    rows, columns = shape
+    size = mi.Vector2f(columns, rows)
+    uv = dr.select(dr.isfinite(uv), uv, 0)
+    position = (uv - dr.floor(uv)) * size
+    if filter_type == "nearest":
+        i = dr.minimum(mi.Vector2u(position), mi.Vector2u(columns - 1, rows - 1))
+        return [i.y * columns + i.x], [mi.Float(1)]
+    # One rounding instead of two: the fraction is what is left after the integer part cancels.
+    position = dr.fma(uv - dr.floor(uv), size, -0.5)
+    low = dr.floor(position)
+    f = position - low
+    i0 = mi.Vector2i(low)
+    i0 = mi.Vector2i(dr.select(i0.x < 0, columns - 1, i0.x), dr.select(i0.y < 0, rows - 1, i0.y))
+    i0 = mi.Vector2i(dr.select(i0.x >= columns, 0, i0.x), dr.select(i0.y >= rows, 0, i0.y))
+    i1 = mi.Vector2i(dr.select(i0.x + 1 >= columns, 0, i0.x + 1), dr.select(i0.y + 1 >= rows, 0, i0.y + 1))
+    a, b = mi.Vector2u(i0), mi.Vector2u(i1)
+    index = [a.y * columns + a.x, a.y * columns + b.x, b.y * columns + a.x, b.y * columns + b.x]
+    weight = [(1 - f.x) * (1 - f.y), f.x * (1 - f.y), (1 - f.x) * f.y, f.x * f.y]
+    return index, weight
+
+
+class Neighbour:
+    """A sample with its weight, and the next sample on the same ring with its own (None where there is no ring)."""
+
+    def __init__(self, index, weight, following=None, following_weight=None):
+        self.index, self.weight = index, weight
+        self.following, self.following_weight = following, following_weight
+
+    def single(self):
+        """The samples one by one: a list of (index, weight)."""
+        pairs = [(self.index, self.weight)]
+        if self.following is not None:
+            pairs.append((self.following, self.following_weight))
+        return pairs
+
+
+class RingTable:
+    """Port of :class:`btfref.numerics.interpolation.RingInterpolation`."""
+
+    def __init__(self, rings):
+        self.rings = np.asarray(rings, float)
+
+    def following(self):
+        """For each sample the next one on its ring, shape (n,)."""
+        result = []
+        for _, _, count, first in self.rings.astype(int):
+            result += [first + (i + 1) % count for i in range(count)]
+        return np.array(result)
+
+    def stencil(self, w, *, hold=True):
+        """List of :class:`Neighbour`: one on the lower and one on the upper ring."""
+        theta = dr.atan2(dr.sqrt(dr.fma(w.x, w.x, w.y * w.y)), w.z)
+        turn = dr.atan2(w.y, w.x) * (0.5 / np.pi)
+        last = len(self.rings) - 1
+        # Tables this small are cheaper as chains of selects than as gathers.
+        above = [theta >= float(ring[0]) for ring in self.rings[1:]]
+
+        def choose(values):
+            values = [float(v) for v in values]
+            result = mi.Float(values[0])
+            for mask, value, previous in zip(above, values[1:], values, strict=False):
+                if any(v != values[0] for v in values) or value != previous:
+                    result = dr.select(mask, value, result)
+            return result
+
+        low = np.arange(last + 1)
+        high = np.minimum(low + 1, last)
+        step = self.rings[high, 0] - self.rings[low, 0]
+        inverse = np.where(step > 0, 1 / np.where(step > 0, step, 1), 0)
+        t = dr.clip((theta - choose(self.rings[low, 0])) * choose(inverse), 0, 1)
+        fade = mi.Float(1)
+        edge = self.rings[last, 0]
+        if not hold and np.cos(edge) > 1e-6:
+            fade = dr.select(theta > float(edge), dr.maximum(w.z, 0) * float(1 / np.cos(edge)), 1)
+        neighbours = []
+        for ring, share in ((low, (1 - t) * fade), (high, t * fade)):
+            count = choose(self.rings[ring, 2])
+            position = (turn - choose(self.rings[ring, 1] / (2 * np.pi))) * count
+            position = dr.select(position < 0, position + count, position)
+            first = dr.clip(dr.floor(position), 0, count - 1)
+            fraction = dr.clip(position - first, 0, 1)
+            following = dr.select(first + 1 < count, first + 1, 0)
+            offset = choose(self.rings[ring, 3])
+            neighbours.append(
+                Neighbour(
+                    mi.UInt32(offset + first),
+                    share * (1 - fraction),
+                    mi.UInt32(offset + following),
+                    share * fraction,
+                )
+            )
+        return neighbours
+
+
+class TriangleTable:
+    """Port of :class:`btfref.numerics.interpolation.TriangleInterpolation`."""
+
+    def __init__(self, triangles, cells):
+        self.n_triangles, self.n_cells = len(triangles), len(cells)
+        self.triangles = mi.Float(np.asarray(triangles, np.float32).ravel())
+        self.cells = mi.UInt32(np.asarray(cells, np.uint32).ravel())
+
+    def following(self):
+        """There are no rings."""
+        return None
+
+    def _row(self, triangle, active=True):
+        packets = [dr.gather(mi.Vector4f, self.triangles, triangle * 6 + i, active) for i in range(6)]
+        return [p[k] for p in packets for k in range(4)]
+
+    @staticmethod
+    def _barycentric(row, w):
+        from_a = w - mi.Vector3f(row[0:3])
+        from_b = w - mi.Vector3f(row[3:6])
+        n_a, n_b, n_c = (mi.Vector3f(row[i : i + 3]) for i in (6, 9, 12))
+        return dr.dot(n_a, from_b), dr.dot(n_b, from_a), dr.dot(n_c, from_a)
+
+    def stencil(self, w, *, hold=True):
+        """List of three :class:`Neighbour` without followers."""
+        w = mi.Vector3f(dr.detach(w))
+        s = w.x / (1 + w.z)
+        t = w.y / (1 + w.z)
+        half = 0.5 * self.n_cells
+        column = mi.UInt32(dr.clip((s + 1) * half, 0, self.n_cells - 1))
+        row = mi.UInt32(dr.clip((t + 1) * half, 0, self.n_cells - 1))
+        start = dr.gather(mi.UInt32, self.cells, row * self.n_cells + column)
+
+        def body(triangle, steps, walking, w):
+            data = self._row(triangle, walking)
+            a, b, c = self._barycentric(data, w)
+            worst = dr.minimum(a, dr.minimum(b, c))
+            # Float32 noise on an edge must not make the walk step back and forth.
+            outside = worst < -1e-6
+            across = dr.select(a == worst, data[18], dr.select(b == worst, data[19], data[20]))
+            triangle = dr.select(walking & outside, mi.UInt32(across), triangle)
+            steps = steps + 1
+            return triangle, steps, walking & outside & (steps < self.n_triangles), w
+
+        triangle, _, _, _ = dr.while_loop(
+            (start, mi.UInt32(0), mi.Bool(True), w), lambda triangle, steps, walking, w: walking, body
+        )
+        data = self._row(triangle)
+        a, b, c = (dr.maximum(x, 0) for x in self._barycentric(data, w))
+        beyond = data[17] < 0
+        c = dr.select(beyond, 0, c)
+        scale = dr.rcp(a + b + c)
+        weights = [a * scale, b * scale, c * scale]
+        if not hold:
+            edge = mi.Vector3f(data[0:3]) * weights[0] + mi.Vector3f(data[3:6]) * weights[1]
+            cos_edge = edge.z * dr.rsqrt(dr.squared_norm(edge))
+            fade = dr.minimum(dr.maximum(w.z, 0) / dr.maximum(cos_edge, 1e-6), 1)
+            weights = [x * dr.select(beyond, fade, 1) for x in weights]
+        indices = [mi.UInt32(dr.maximum(x, 0)) for x in data[15:18]]
+        return [Neighbour(i, x) for i, x in zip(indices, weights, strict=True)]
+
+
+def direction_table(arrays, prefix):
+    """The port of the interpolation whose tables are stored under ``prefix``."""
+    if f"{prefix}_rings" in arrays:
+        return RingTable(arrays[f"{prefix}_rings"])
+    return TriangleTable(arrays[f"{prefix}_triangles"], arrays[f"{prefix}_cells"])
+
+
+def tensor(array):
+    """A Dr.Jit tensor of the array's own type (float16, float32 or uint32)."""
+    array = np.ascontiguousarray(array)
+    kind = {"float16": mi.TensorXf16, "float32": mi.TensorXf, "uint32": mi.TensorXu}[array.dtype.name]
+    return kind(array)
+
+
+class PairTable:
+    """Blend of the entries of a table over direction pairs: the inner loop of every tabulated method.
+
+    Parameters
+    ----------
+    values : TensorXf or TensorXf16, shape (outer, n_views, n_lights, width)
+        ``width`` a multiple of 4.
+    following : ndarray of int, shape (n_lights,), or None
+        The next light on each light's ring.
+
+    Notes
+    -----
+    Gathers dominate the cost, and their cost is the number of 32-bit words. Half tables on ring grids are therefore
+    kept as words that hold one value of a light and the same value of the next light on its ring: one word feeds two
+    of the four lights of a lookup. Such words are read sixteen (else four) at a time.
+    """
+
+    def __init__(self, values, following):
+        self.following = following
+        self.update(values)
+
+    def update(self, values):
+        """Take new values; differentiable ones are kept as they are, so that gradients reach them."""
+        self.outer, self.n_views, self.n_lights, self.width = values.shape
+        self.values = values.array
+        self.words = None
+        half = dr.type_v(self.values) == dr.VarType.Float16
+        if half and not dr.grad_enabled(self.values) and self.following is not None:
+            halves = np.asarray(values.numpy()).view(np.uint16)
+            words = halves[..., self.following, :].astype(np.uint32) << 16
+            words |= halves
+            self.words = dr.reinterpret_array(mi.Float, mi.UInt32(words.ravel()))
+            dr.eval(self.words)
+            # The plain copy is only needed for gradients.
+            self.values = None
+
+    def blend(self, outer, views, lights, active=True):
+        """Interpolate over views and lights.
+
+        Parameters
+        ----------
+        outer : UInt32
+            Index of the outermost axis.
+        views, lights : list of Neighbour
+        active : Bool
+
+        Returns
+        -------
+        list of Float
+            ``width`` values.
+        """
+        total = [mi.Float(0)] * self.width
+        for neighbour in views:
+            for view, view_weight in neighbour.single():
+                base = (outer * self.n_views + view) * self.n_lights
+                for light in lights:
+                    if self.words is not None:
+                        self._add_pair(total, base + light.index, view_weight, light, active)
+                    else:
+                        for index, weight in light.single():
+                            self._add_single(total, base + index, view_weight * weight, active)
+        return total
+
+    def _add_pair(self, total, entry, view_weight, light, active):
+        low_weight = view_weight * light.weight * HALF_SCALE
+        high_weight = view_weight * light.following_weight * HALF_SCALE
+        for k, word in enumerate(read_packets(self.words, entry, self.width, active)):
+            word = dr.reinterpret_array(mi.UInt32, word)
+            low = dr.reinterpret_array(mi.Float, ((word << 13) & 0x0FFFE000) | ((word << 16) & 0x80000000))
+            high = dr.reinterpret_array(mi.Float, ((word >> 3) & 0x0FFFE000) | (word & 0x80000000))
+            total[k] = dr.fma(high, high_weight, dr.fma(low, low_weight, total[k]))
+
+    def _add_single(self, total, entry, weight, active):
+        for k, value in enumerate(read_packets(self.values, entry, self.width, active)):
+            total[k] = dr.fma(mi.Float(value), weight, total[k])
+
+
+def read_packets(array, entry, width, active=True):
+    """``width`` consecutive values of entry ``entry``, gathered in the largest packets that fit."""
+    result = []
+    if dr.type_v(array) == dr.VarType.Float16:
+        return [dr.gather(mi.Float16, array, entry * width + k, active) for k in range(width)]
+    while len(result) < width:
+        # Packets must be aligned to their own size.
+        if width % 16 == 0:
+            packet = dr.gather(mi.Matrix4f, array, entry * (width // 16) + len(result) // 16, active)
+            result += [packet[row, column] for row in range(4) for column in range(4)]
+        else:
+            packet = dr.gather(mi.Vector4f, array, entry * (width // 4) + len(result) // 4, active)
+            result += [packet[k] for k in range(4)]
+    return result

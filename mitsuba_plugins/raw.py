@@ -1,0 +1,32 @@
+"""Dr.Jit port of :mod:`btfref.representations.raw`."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from mitsuba_plugins.lookup import PairTable, texel_stencil
+
+
+class Evaluator:
+    """Interpolates the table of a ``raw`` BTF."""
+
+    def __init__(self, maps):
+        self.views, self.lights = maps.views, maps.lights
+        self.shape, self.filter_type = maps.shape, maps.filter_type
+        self.update(maps)
+
+    def update(self, maps):
+        """Take over changed maps."""
+        values = maps.tensors["values"]
+        rows, columns, n_views, n_lights, width = values.shape
+        table = type(values)(values.array, (rows * columns, n_views, n_lights, width))
+        self.values = PairTable(table, self.lights.following())
+
+    def evaluate(self, uv, w_light, w_view, active):
+        """B in 1/sr for valid directions."""
+        views, lights = self.views.stencil(w_view), self.lights.stencil(w_light, hold=False)
+        total = mi.Color3f(0)
+        for texel, weight in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True):
+            value = self.values.blend(texel, views, lights, active)
+            total += mi.Color3f(value[:3]) * weight
+        return total
