@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,13 +70,15 @@ def demo(output="output/demo", *, progress=None):
     DemoResult
     """
     from btfref.report import write_report
+    from btfref.sampling.synthesis import synthesize
 
     output = Path(output)
     output.mkdir(parents=True, exist_ok=True)
     clock = _Clock()
     store = output / "checker.btf.zarr"
     with clock("synthesis"):
-        btf = _synthesize(store, progress)
+        # The folder is the demo's own: a store that another version of it made is replaced.
+        btf = synthesize(**SYNTHESIS, out=store, overwrite=True, progress=progress)
     files = {}
     for key in METHODS:
         with clock(f"fit {key}"):
@@ -115,18 +116,6 @@ class _Clock:
 
     def __exit__(self, *_):
         self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + time.perf_counter() - self._start
-
-
-def _synthesize(store, progress):
-    from btfref.errors import InputError
-    from btfref.sampling.synthesis import synthesize
-
-    try:
-        return synthesize(**SYNTHESIS, out=store, progress=progress)
-    except InputError:
-        # Made by another version of the demo, or damaged. The folder is the demo's own, so start afresh.
-        shutil.rmtree(store, ignore_errors=True)
-        return synthesize(**SYNTHESIS, out=store, progress=progress)
 
 
 def _fit(key, btf, output, progress):

@@ -227,10 +227,57 @@ def write_images(image, out, *, png=False, classes=None, classes_out=None):
     classes : ndarray of uint8, shape (H, W), optional
         Pixel classes, written to `classes_out`.
     """
-    from btfref.compare import save_classes, save_image
+    from btfref.compare import save_image
 
     save_image(out, image)
     if png:
         save_image(out.with_suffix(".png"), image)
     if classes is not None:
         save_classes(classes_out, classes)
+
+
+#: Grey levels of a class file per class number, so that a person sees the classes.
+_CLASS_STEP = 100
+
+
+def save_classes(path, classes):
+    """Write pixel classes (0 background, 1 interior, 2 silhouette) as a grey PNG: black, dark, light."""
+    import numpy as np
+
+    from btfref.compare.png import encode_png
+
+    temporary = path.with_name(f".{path.name}.partial")
+    try:
+        temporary.write_bytes(encode_png(np.asarray(classes, np.uint8) * _CLASS_STEP))
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load_classes(path):
+    """Pixel classes as `save_classes` wrote them.
+
+    Returns
+    -------
+    ndarray of uint8, shape (H, W)
+
+    Raises
+    ------
+    InputError
+        When the file is missing, not a PNG, or holds another grey level.
+    """
+    import numpy as np
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            grey = np.asarray(image.convert("L"))
+    except FileNotFoundError:
+        raise InputError("no such file", file=path, field="--classes") from None
+    except (OSError, SyntaxError, ValueError):
+        raise InputError("cannot be read as PNG", file=path, field="--classes") from None
+    known = [number * _CLASS_STEP for number in range(3)]
+    if not np.isin(grey, known).all():
+        odd = int(grey[~np.isin(grey, known)][0])
+        raise InputError("not pixel classes", file=path, got=f"grey level {odd}", expected=known)
+    return grey // _CLASS_STEP

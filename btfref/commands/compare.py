@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from btfref.commands._shared import emit, emit_json, number, output_file, table
+from btfref.commands._shared import emit, emit_json, load_classes, number, output_file, table
 
 
 def add_arguments(parser):
@@ -26,7 +26,7 @@ def run(args):
     """Carry the command out."""
     report = output_file(args.report, ".html") if args.report else None
 
-    from btfref.compare import compare, load_classes, load_image
+    from btfref.compare import compare, load_image
 
     test, reference = load_image(args.test), load_image(args.reference)
     classes = load_classes(args.classes) if args.classes else None

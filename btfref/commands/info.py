@@ -64,7 +64,7 @@ def _headers(path):
 
     try:
         with OpenEXR.File(str(path), header_only=True) as file:
-            return [part.header for part in file.parts]
+            return [dict(part.header) for part in file.parts]  # closing the file empties them
     except RuntimeError:
         return None
 
@@ -107,6 +107,8 @@ def lines(facts, indent=""):
     """Facts as aligned ``key  value`` lines; nested ones are indented."""
     width = max(len(key) for key in facts)
     for key, fact in facts.items():
+        if key == "attributes":  # what matters of them stands above; --json has them all
+            continue
         if isinstance(fact, dict) and fact:
             yield f"{indent}{key}"
             yield from lines(fact, indent + "  ")

@@ -15,6 +15,7 @@ from btfref.commands._shared import (
     emit_json,
     output_file,
 )
+from btfref.errors import InputError
 
 
 def add_arguments(parser):
@@ -40,6 +41,7 @@ def add_arguments(parser):
     parser.add_argument(
         "--set", nargs="+", action="extend", metavar="KEY=VALUE", help="parameters of the mesostructure"
     )
+    parser.add_argument("--overwrite", action="store_true", help="replace a store of other settings")
     parser.add_argument("--json", action="store_true", help="print the facts of the store as JSON")
 
 
@@ -47,26 +49,27 @@ def run(args):
     """Carry the command out."""
     out = output_file(args.output, ".btf.zarr")
     parameters = assignments(args.set)
-    views, lights = direction_set(args.views), direction_set(args.lights)
+    settings = {
+        "texels": args.texels,
+        "views": direction_set(args.views),
+        "lights": direction_set(args.lights),
+        "spp": args.spp,
+        "seed": args.seed,
+        "max_depth": args.max_depth,
+        "dtype": args.dtype,
+    }
+    for key in parameters:
+        if key in settings:
+            option = f"--{key.replace('_', '-')}"
+            raise InputError("not a parameter of the mesostructure", field="--set", got=key, expected=option)
 
-    from btfref.sampling import open_store
-    from btfref.sampling.synthesis import synthesize
+    from btfref.sampling.synthesis import synthesize_store
 
     with Progress() as progress:
-        synthesize(
-            args.mesostructure,
-            texels=args.texels,
-            views=views,
-            lights=lights,
-            spp=args.spp,
-            seed=args.seed,
-            out=out,
-            max_depth=args.max_depth,
-            dtype=args.dtype,
-            progress=progress,
-            **parameters,
+        store = synthesize_store(
+            out, args.mesostructure, overwrite=args.overwrite, progress=progress, **settings, **parameters
         )
-    info = open_store(out).info()
+    info = store.info()
     if args.json:
         emit_json(info)
     else:
