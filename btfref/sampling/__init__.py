@@ -1,0 +1,8 @@
+"""Sampled BTFs: in memory, on disk, and their synthesis from mesostructure."""
+
+from __future__ import annotations
+
+from btfref.sampling.sampled_btf import SampledBTF
+from btfref.sampling.store import BTFStore, attributes_of, open_store
+
+__all__ = ["BTFStore", "SampledBTF", "attributes_of", "open_store"]

@@ -1,11 +1,11 @@
 """The reference estimator of a synthetic BTF: paths from the view side, each shared by all lights.
 
-A sample of texel t and view v is a uniform point in the texel's square on the sampling plane z = 0 (the top of the
-mesostructure); the ray through it along −w_view finds the first surface point, so that oblique views get their
-exact sheared footprint. At every vertex of the path all lights are connected by a shadow ray and the BSDF, which
-gives one number per light from one path. A light has unit irradiance perpendicular to its direction: the result
-is B = f · cos θ_light in 1/sr with shadows, masking and interreflection. Vertices are the same for all lights,
-so the lights of a texel are correlated, its samples are not.
+A sample of texel t and view v is a uniform point in the texel's square on the sampling plane z = 0 (the top
+of the mesostructure); the ray through it along −w_view finds the first surface point, so that oblique views
+get their exact sheared footprint. At every vertex of the path all lights are connected by a shadow ray and
+the BSDF, which gives one number per light from one path. A light has unit irradiance perpendicular to its
+direction: the result is B = f · cos θ_light in 1/sr with shadows, masking and interreflection. Vertices are
+the same for all lights, so the lights of a texel are correlated, its samples are not.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ START = 0.125
 def strata(spp):
     """How the samples of one texel are stratified over its square.
 
-    Each stratum holds m ≥ 2 independent samples, m the smallest prime factor of ``spp``; the spread inside the
-    strata then gives an unbiased variance of the stratified mean.
+    Each stratum holds m ≥ 2 independent samples, m the smallest prime factor of ``spp``; the spread inside
+    the strata then gives an unbiased variance of the stratified mean.
 
     Parameters
     ----------
@@ -71,18 +71,16 @@ class PathEstimator:
     seed : int
     max_depth : int
         As in Mitsuba's path integrator: 2 is direct light only, −1 has no limit.
-    reach_directions : ndarray, shape (n, 3), optional
-        View directions that will be asked for; only sizes the tiled patch, never the result's expectation.
 
     Notes
     -----
-    Build and use it inside one `mitsuba_variant` block. Light that reaches a point through delta lobes (smooth
-    glass) is missing, as in every path tracer with delta lights.
+    Build and use it inside one `mitsuba_variant` block. Light that reaches a point through delta lobes
+    (smooth glass) is missing, as in every path tracer with delta lights.
     """
 
     key = "path"
 
-    def __init__(self, mesostructure, lights, *, texels, spp, seed, max_depth, reach_directions=None):
+    def __init__(self, mesostructure, lights, *, texels, spp, seed, max_depth):
         import drjit as dr
         import mitsuba as mi
 
@@ -95,7 +93,8 @@ class PathEstimator:
         self.lit = np.flatnonzero(lights[:, 2] > 0)
         self.n_lights = len(lights)
 
-        # A shadow ray from the depth of the mesostructure to its top must not leave the patch, or it is wrapped.
+        # A shadow ray from the depth of the mesostructure to its top must not leave the patch, or it is
+        # wrapped.
         z = lights[self.lit, 2] if len(self.lit) else np.ones(1)
         across = -self.low * float((np.sqrt(1 - np.minimum(z, 1) ** 2) / z).max()) + mesostructure.overhang
         self.reach = int(np.clip(math.ceil(across + START), 1, MAXIMUM_REACH))
@@ -247,7 +246,7 @@ class PathEstimator:
         return dr.minimum(self.reach / dr.maximum(dr.abs(direction.x), dr.abs(direction.y)), 1e4)
 
     def _wrapped(self, origin, direction, travel):
-        """The place at the patch's border, taken back to the central tile, and whether the slab goes on there."""
+        """The place at the patch's border, taken to the central tile, and whether the slab goes on there."""
         import drjit as dr
         import mitsuba as mi
 

@@ -1,0 +1,318 @@
+"""Synthesis of a BTF from modelled mesostructure: every view, all lights, resumable."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+from pathlib import Path
+
+import numpy as np
+
+from btfref.errors import InputError
+from btfref.mesostructure import build
+from btfref.numerics.directions import directions
+from btfref.sampling.sampled_btf import SampledBTF, remove_store
+from btfref.sampling.store import (
+    CONVENTIONS,
+    TILE,
+    check_finite,
+    create_store,
+    open_store,
+    remove_leftovers,
+)
+from btfref.sampling.variant import mitsuba_variant
+from btfref.versions import versions
+
+#: name -> "module:class". An estimator is made from (mesostructure, light vectors, texels, spp, seed,
+#: max_depth) and gives ``view(index, w_view) -> mean, variance of the mean``, each (lights, rows, columns,
+#: 3) float32, from numbers that depend on the seed and the view's index only: any order and any subset of
+#: views gives the same bytes.
+ESTIMATORS = {"path": "btfref.sampling.path_estimator:PathEstimator"}
+
+#: What a result depends on; recorded with it.
+VERSIONS = ("numpy", "mitsuba", "drjit")
+
+_LARGEST = {"texels": 4096, "spp": 1 << 20}
+
+
+def synthesize(
+    mesostructure="checker",
+    *,
+    texels=64,
+    views="ubo81",
+    lights="ubo81",
+    spp=64,
+    seed=0,
+    out=None,
+    max_depth=8,
+    dtype="float16",
+    progress=None,
+    estimator="path",
+    overwrite=False,
+    variant="llvm_ad_rgb",
+    **parameters,
+):
+    """Path trace a mesostructure into a sampled BTF.
+
+    Parameters
+    ----------
+    mesostructure : str or Mesostructure
+        See ``btfref.mesostructure.names()``.
+    texels : int or (int, int)
+        Texels along each side of the tile, or rows and columns.
+    views, lights : str, DirectionSet or array_like (n, 3)
+        See `btfref.numerics.directions.directions`.
+    spp : int
+        Samples per texel and view, at least 2; each serves all lights.
+    seed : int
+        Same seed, same bytes (on the same machine).
+    out : path-like, optional
+        Store to write, ``NAME.btf.zarr``. An interrupted run is continued, a finished one of the same
+        settings is returned as it is. None keeps the result in memory only.
+    max_depth : int
+        As in Mitsuba: 2 is direct light only, −1 has no limit.
+    dtype : {"float16", "float32"}
+        Type of the stored values. Variance is float32.
+    progress : callable, optional
+        Called as ``progress(done, total, label)`` after each view.
+    estimator : str
+        "path".
+    overwrite : bool
+        Replace a store of other settings.
+    variant : str
+        Mitsuba variant; it is part of the settings, since bytes differ between backends.
+    **parameters
+        Of the mesostructure.
+
+    Returns
+    -------
+    SampledBTF
+
+    Raises
+    ------
+    InputError
+        A setting that cannot be used, or a store of other settings at `out`.
+
+    Notes
+    -----
+    Values are radiance per unit irradiance perpendicular to the light (1/sr); each is the mean over the
+    texel's square on the sampling plane z = 0, seen along the view: oblique views have sheared footprints.
+    """
+    job = _Job(
+        mesostructure, parameters, texels, views, lights, spp, seed, max_depth, dtype, estimator, variant
+    )
+    if out is not None:
+        return SampledBTF.load(job.to_store(out, overwrite=overwrite, progress=progress).path)
+    shape = (len(job.views), len(job.lights), *job.texels, 3)
+    values, variance = np.zeros(shape, dtype), np.zeros(shape, np.float32)
+    for view, mean, spread in job.results(range(len(job.views)), progress):
+        with np.errstate(over="ignore"):
+            values[view] = mean
+        variance[view] = spread
+        check_finite(values[view : view + 1], None, "values")
+    return SampledBTF(values, job.views, job.lights, variance, {**CONVENTIONS, **job.attributes})
+
+
+def synthesize_store(out, mesostructure="checker", *, overwrite=False, progress=None, **settings):
+    """As `synthesize` with ``out``, without reading the result into memory.
+
+    Parameters
+    ----------
+    out : path-like
+    mesostructure, overwrite, progress, **settings
+        As for `synthesize`.
+
+    Returns
+    -------
+    BTFStore
+        Complete.
+    """
+    defaults = {
+        "texels": 64,
+        "views": "ubo81",
+        "lights": "ubo81",
+        "spp": 64,
+        "seed": 0,
+        "max_depth": 8,
+        "dtype": "float16",
+        "estimator": "path",
+        "variant": "llvm_ad_rgb",
+    }
+    chosen = {key: settings.pop(key, value) for key, value in defaults.items()}
+    return _Job(mesostructure, settings, **chosen).to_store(out, overwrite=overwrite, progress=progress)
+
+
+class _Job:
+    """Checked settings of one synthesis."""
+
+    def __init__(
+        self,
+        mesostructure,
+        parameters,
+        texels,
+        views,
+        lights,
+        spp,
+        seed,
+        max_depth,
+        dtype,
+        estimator,
+        variant,
+    ):
+        sides = texels if np.ndim(texels) else (texels, texels)
+        if len(sides) != 2:
+            raise InputError(
+                "texels of the tile", field="texels", got=texels, expected="n or (rows, columns)"
+            )
+        self.texels = tuple(_whole("texels", side, 1, _LARGEST["texels"]) for side in sides)
+        self.spp = _whole("spp", spp, 2, _LARGEST["spp"])
+        self.seed = _whole("seed", seed, 0, 2**63 - 1)
+        self.max_depth = -1 if max_depth == -1 else _whole("max_depth", max_depth, 2, 10_000)
+        if dtype not in ("float16", "float32"):
+            raise InputError(
+                "type of the values", field="dtype", got=repr(dtype), expected="float16 or float32"
+            )
+        if estimator not in ESTIMATORS:
+            raise InputError(
+                "unknown estimator",
+                field="estimator",
+                got=repr(estimator),
+                expected=f"one of {', '.join(ESTIMATORS)}",
+            )
+        self.dtype, self.estimator, self.variant = dtype, estimator, variant
+        self.views, self.lights = directions(views), directions(lights)
+        self.mesostructure = build(mesostructure, **parameters)
+        self.attributes = {
+            "seed": self.seed,
+            "estimator": estimator,
+            "parameters": {
+                "texels": list(self.texels),
+                "spp": self.spp,
+                "max_depth": self.max_depth,
+                "dtype": dtype,
+                "variant": variant,
+                "tile": TILE,
+            },
+            "parent": {
+                "kind": "mesostructure",
+                "name": self.mesostructure.name,
+                "parameters": self.mesostructure.parameters,
+                "geometry": _digest(self.mesostructure),
+            },
+            "versions": versions(VERSIONS),
+        }
+
+    def results(self, wanted, progress=None, done=0):
+        """Mean and variance of the wanted views, one after the other."""
+        wanted = list(wanted)
+        if not wanted:
+            return
+        module, _, name = ESTIMATORS[self.estimator].partition(":")
+        make = getattr(importlib.import_module(module), name)
+        with mitsuba_variant(self.variant):
+            estimator = make(
+                self.mesostructure,
+                self.lights.vectors,
+                texels=self.texels,
+                spp=self.spp,
+                seed=self.seed,
+                max_depth=self.max_depth,
+            )
+            for count, view in enumerate(wanted, 1):
+                yield view, *estimator.view(view, self.views.vectors[view])
+                if progress is not None:
+                    progress(done + count, done + len(wanted), "synthesis")
+
+    def to_store(self, out, *, overwrite=False, progress=None):
+        """Fill the store at ``out``, from where an earlier run of the same settings stopped."""
+        out = Path(out)
+        remove_leftovers(out)
+        store = None
+        if out.exists() or out.is_symlink():
+            store = self._resumable(out, overwrite)
+        if store is None:
+            store = create_store(
+                out,
+                views=self.views,
+                lights=self.lights,
+                texels=self.texels,
+                dtype=self.dtype,
+                attributes=self.attributes,
+            )
+        missing = np.flatnonzero(~store.coverage.all(axis=(1, 2, 3)))
+        done = len(self.views) - len(missing)
+        for view, mean, spread in self.results(missing, progress, done):
+            store.write_view(view, mean, spread)
+        return store
+
+    def _resumable(self, out, overwrite):
+        """The store at ``out`` when it belongs to these settings; None when it was removed."""
+        try:
+            store = open_store(out)
+            found = {
+                "views": store.views.vectors.tolist(),
+                "lights": store.lights.vectors.tolist(),
+                **store.attributes,
+            }
+        except InputError:
+            if not overwrite:
+                raise
+            remove_store(out)
+            return None
+        wanted = {
+            "views": self.views.vectors.tolist(),
+            "lights": self.lights.vectors.tolist(),
+            **self.attributes,
+        }
+        if store.complete:
+            # A finished result stays what it is when a library is updated; a half-done one must not be mixed.
+            wanted.pop("versions")
+        for key, value in wanted.items():
+            if found.get(key) == value:
+                continue
+            if overwrite:
+                remove_store(out)
+                return None
+            field, got, expected = _difference(key, found.get(key), value)
+            raise InputError(
+                "store of other settings; choose another name or overwrite it",
+                file=out,
+                field=field,
+                got=got,
+                expected=expected,
+            )
+        return store
+
+
+def _difference(key, found, wanted):
+    """The first entry in which two settings differ."""
+    while isinstance(found, dict) and isinstance(wanted, dict):
+        inner = next(name for name in {**wanted, **found} if found.get(name) != wanted.get(name))
+        key, found, wanted = f"{key}.{inner}", found.get(inner), wanted.get(inner)
+    if isinstance(wanted, list) and len(wanted) > 8:
+        return key, "other directions", f"{len(wanted)} directions as asked for"
+    return key, found, wanted
+
+
+def _whole(name, value, low, high):
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= high:
+        raise InputError(
+            "setting of the synthesis", field=name, got=value, expected=f"a whole number in [{low}, {high}]"
+        )
+    return int(value)
+
+
+def _digest(mesostructure):
+    """Fingerprint of geometry and materials: a user's mesh has no parameters that say what it is."""
+    state = hashlib.sha256()
+    for part in mesostructure.parts:
+        state.update(json.dumps(part.bsdf, sort_keys=True).encode())
+        for array in (part.vertices, part.faces, part.normals, part.uv):
+            if array is not None:
+                state.update(str((array.dtype, array.shape)).encode())
+                # float32 is what is traced; the last bits of float64 may differ between C libraries.
+                state.update(
+                    np.asarray(array, np.float32 if array.dtype.kind == "f" else np.uint32).tobytes()
+                )
+    return state.hexdigest()[:32]
