@@ -56,7 +56,7 @@ def required(name):
 
 @pytest.fixture(scope="session")
 def need():
-    """``need("gl")`` returns what was found; missing, it skips the test, or fails it if BTFREF_REQUIRE says so."""
+    """``need("gl")`` returns what was found; if missing it skips, or fails where BTFREF_REQUIRE says so."""
 
     def check(name):
         found = CAPABILITIES[name]()

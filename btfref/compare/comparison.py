@@ -60,7 +60,7 @@ class Comparison:
         return bool(self.gates) and all(gate.passed for gate in self.gates)
 
     def to_dict(self):
-        """Strict JSON: numbers, text and truth values; what is not finite as ``"inf"``, ``"-inf"``, ``"nan"``."""
+        """Strict JSON; numbers that are not finite become ``"inf"``, ``"-inf"`` or ``"nan"``."""
         return json_safe(
             {
                 "kind": "comparison",
@@ -164,7 +164,8 @@ def compare(test, reference, *, classes=None, gate=None, variance=None, display=
     if variance is not None:
         maps["p_value"] = np.full(t.shape, np.nan)
         known = finite & np.isfinite(variance).all(-1)
-        maps["p_value"][known] = significance.welch_test(t[known], variance[known], r[known], 0.0)[1]
+        if known.any():
+            maps["p_value"][known] = significance.welch_test(t[known], variance[known], r[known], 0.0)[1]
         statistics = {
             name: _class_statistics(t, r, variance, mask & known, maps["p_value"])
             for name, mask in masks.items()
@@ -206,8 +207,7 @@ def agreement(test, reference, *, gate="probe.agreement"):
     Returns
     -------
     Comparison
-        Without maps and pictures; ``settings["worst"]`` is the flat index of the worst entry. NaN and infinity
-        fail.
+        Without maps and pictures; ``settings["worst"]`` is the flat index of the worst entry. NaN fails.
     """
     t, r = metrics.paired(test, reference)
     t, r = t.reshape(-1, t.shape[-1]), r.reshape(-1, r.shape[-1])

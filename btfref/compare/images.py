@@ -22,7 +22,8 @@ def load_image(path, *, finite=False):
     ----------
     path : path-like
         ``.exr``: channels R, G, B (or Y, shown grey) of the first part, values as they are, placed in the
-        display window. ``.png``: sRGB, decoded to linear; 8 bits count, whatever the file holds. Alpha is left out.
+        display window. ``.png``: sRGB, decoded to linear; colour counts with 8 bits, whatever the file
+        holds. Alpha is left out.
     finite : bool, optional
         Refuse NaN and infinities; `compare` counts them and fails its gate.
 

@@ -1,0 +1,401 @@
+"""The comparison, its gates shown to fail, pictures in files, and the limits themselves."""
+
+import json
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from btfref.compare import (
+    Comparison,
+    Display,
+    agreement,
+    compare,
+    gate_table,
+    judge,
+    load_image,
+    missing_reference,
+    reason,
+    save_image,
+    tolerance,
+)
+from btfref.compare.tolerances import gate_keys, limits, parse
+from btfref.errors import InputError
+
+ROOT = Path(__file__).parents[2]
+INTERIOR, SILHOUETTE = 1, 2
+
+
+@pytest.fixture
+def scene(rng):
+    """A disc on a black background: reference and class map."""
+    y, x = np.mgrid[0:64, 0:64] - 31.5
+    radius = np.hypot(x, y)
+    classes = np.where(radius < 24, INTERIOR, np.where(radius < 25.5, SILHOUETTE, 0)).astype(np.uint8)
+    texture = 0.2 + 0.15 * np.sin(x / 3)[..., None] * np.cos(y[..., None] / [2, 3, 5])
+    return np.where((classes > 0)[..., None], texture, 0.0).astype(np.float32), classes
+
+
+def names(results, outcome="fail"):
+    return {result.name for result in results if result.outcome == outcome}
+
+
+def test_equal_pictures_pass_every_class(scene):
+    reference, classes = scene
+    found = compare(
+        reference,
+        reference,
+        classes=classes,
+        gate=["image.noise_free", "image.silhouette", "image.background"],
+    )
+    assert found.passed
+    assert set(found.metrics) == {"interior", "silhouette", "background", "all"}
+    assert found.metrics["interior"]["rmse"] == 0
+    assert found.metrics["interior"]["psnr"] == np.inf
+    assert found.counts["all"] == 64 * 64
+    assert {gate.outcome for gate in found.gates} == {"pass"}
+
+
+def test_each_class_has_its_own_errors(scene):
+    reference, classes = scene
+    test = reference.copy()
+    test[classes == SILHOUETTE] += 0.1
+    found = compare(test, reference, classes=classes, gate=["image.noise_free", "image.silhouette"])
+    assert found.metrics["interior"]["max_abs"] == 0
+    assert found.metrics["silhouette"]["bias"] == pytest.approx(0.1, rel=tolerance("metric.float32.rtol"))
+    assert names(found.gates) == {"image.silhouette.failing_fraction", "image.silhouette.nrmse"}
+    assert not found.passed
+
+
+@pytest.mark.parametrize("factor", [2.0, 0.5])
+def test_an_error_around_the_limit_decides(scene, factor):
+    reference, classes = scene
+    test = reference * (1 + factor * tolerance("image.noise_free.p999"))
+    found = compare(test, reference, classes=classes, gate="image.noise_free")
+    assert found.passed == (factor < 1)
+    assert names(found.gates) == (set() if factor < 1 else {"image.noise_free.p999"})
+
+
+def test_one_bad_pixel_fails_the_hard_maximum_alone(scene):
+    reference, classes = scene
+    test = reference.copy()
+    test[32, 32] *= 1 + 3 * tolerance("image.noise_free.max")
+    found = compare(test, reference, classes=classes, gate="image.noise_free")
+    assert names(found.gates) == {"image.noise_free.max"}
+    gate = found.gates[-1]
+    assert gate.value > gate.limit
+    assert gate.reason == reason("image.noise_free")
+    assert "above" in gate.detail
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("side", ["test", "reference"])
+def test_values_that_are_not_finite_fail_and_are_counted(scene, value, side):
+    reference, classes = scene
+    broken = reference.copy()
+    broken[30, 30, 1] = value
+    pair = (broken, reference) if side == "test" else (reference, broken)
+    found = compare(*pair, classes=classes, gate="image.noise_free")
+    assert names(found.gates) == {"image.finite.nonfinite"}
+    assert found.counts[f"nonfinite_{side}"] == 1
+    assert f"1 in the {side}" in found.gates[0].detail
+    assert found.metrics["interior"]["rmse"] == 0
+    assert np.isnan(found.maps["relative"][30, 30])
+    json.dumps(found.to_dict(), allow_nan=False)
+
+
+def test_a_picture_of_nan_fails_with_a_number_for_nothing(scene):
+    reference, classes = scene
+    found = compare(np.full_like(reference, np.nan), reference, classes=classes, gate="image.noise_free")
+    assert not found.passed
+    assert all(gate.value is None for gate in found.gates if gate.gate == "image.noise_free")
+
+
+def test_without_classes_nothing_is_excused(scene):
+    reference, _ = scene
+    test = reference.copy()
+    test[0, 0] += 0.1
+    assert compare(test, reference, gate="image.noise_free").passed is False
+
+
+def test_a_class_without_pixels_fails_unless_it_may_be_empty(scene):
+    reference, classes = scene
+    found = compare(
+        reference, reference, classes=np.zeros_like(classes), gate=["image.noise_free", "image.silhouette"]
+    )
+    assert names(found.gates) == {"image.noise_free.p999", "image.noise_free.max"}
+    assert names(found.gates, "empty") == {"image.silhouette.failing_fraction", "image.silhouette.nrmse"}
+
+
+def test_negative_values_are_counted_and_not_clamped(scene):
+    reference, classes = scene
+    test = reference.copy()
+    test[32, 32, 0] = -0.5
+    found = compare(test, reference, classes=classes)
+    assert found.counts["negative_test"] == 1
+    assert found.maps["difference"][32, 32, 0] == pytest.approx(-0.5 - reference[32, 32, 0])
+
+
+def test_settings_name_every_constant(scene):
+    reference, classes = scene
+    found = compare(reference, reference, classes=classes).settings
+    assert {"relmse_epsilon", "smape_epsilon", "relative_floor", "psnr_peak", "display", "flip"} <= set(found)
+    assert {"startExposure", "stopExposure", "tonemapper", "ppd"} <= set(found["flip"])
+    assert compare(reference, reference, display=Display(1.0), flip=False).settings["display"]["stops"] == 1.0
+
+
+def test_noise_alone_passes_the_difference_test_and_a_bias_does_not(scene, rng):
+    reference, classes = scene
+    sigma = 0.01
+    test = reference + sigma * rng.standard_normal(reference.shape)
+    variance = np.full(reference.shape, sigma**2)
+    found = compare(
+        test, reference, classes=classes, gate="image.difference", variance=(variance, 0 * variance)
+    )
+    assert found.passed
+    statistics = found.statistics["interior"]
+    assert statistics["bias"]["low"] < 0 < statistics["bias"]["high"]
+    assert statistics["rmse_without_noise"]["low"] == 0
+    assert statistics["rmse_without_noise"]["high"] < sigma
+    biased = compare(test + 8 * sigma, reference, classes=classes, gate="image.difference", variance=variance)
+    assert names(biased.gates) == {"image.difference.rejected_fraction"}
+
+
+@pytest.mark.parametrize(
+    ("noise", "error", "outcome"), [(1e-4, 0, "pass"), (0.5, 0, "inconclusive"), (1e-3, 0.2, "fail")]
+)
+def test_equivalence_gate(scene, rng, noise, error, outcome):
+    reference, classes = scene
+    test = reference * (1 + error) + noise * rng.standard_normal(reference.shape)
+    carried = SimpleNamespace(image=test, variance=np.full(reference.shape, noise**2))
+    found = compare(carried, reference, classes=classes, gate="image.equivalence")
+    assert found.gates[-1].outcome == outcome
+    assert found.passed == (outcome == "pass")
+    assert "interval" in found.gates[-1].detail
+
+
+@pytest.mark.parametrize("gate", ["image.difference", "image.equivalence"])
+def test_statistical_gates_fail_without_variances(scene, gate):
+    reference, classes = scene
+    found = compare(reference, reference, classes=classes, gate=gate)
+    assert not found.passed
+    assert "variance" in found.gates[-1].detail
+    nan = np.full(reference.shape, np.nan)
+    assert not compare(reference, reference, classes=classes, gate=gate, variance=nan).passed
+
+
+def test_dictionary_is_strict_json(scene):
+    reference, classes = scene
+    text = json.dumps(compare(reference, reference, classes=classes).to_dict(), allow_nan=False)
+    assert json.loads(text)["metrics"]["interior"]["psnr"] == "inf"
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"test": np.zeros((3, 4, 3))}, "shape"),
+        ({"test": np.zeros((64, 64))}, "picture"),
+        ({"classes": np.zeros((3, 3), int)}, "class"),
+        ({"classes": np.full((64, 64), 7)}, "class"),
+        ({"gate": "image.nonsense"}, "gate"),
+        ({"variance": np.zeros((2, 2, 3))}, "variance"),
+        ({"test": "nowhere.exr"}, "nowhere.exr"),
+    ],
+)
+def test_bad_input_is_one_clear_line(scene, change, word):
+    reference, classes = scene
+    arguments = {"test": reference, "reference": reference, "classes": classes} | change
+    with pytest.raises(InputError, match=word) as error:
+        compare(**arguments)
+    assert "\n" not in str(error.value)
+
+
+# --- lists of values -------------------------------------------------------------------------------------
+
+
+def test_agreement_of_probes(rng):
+    reference = rng.random((5000, 3))
+    assert agreement(reference, reference).passed
+    limit = tolerance("probe.agreement.max")
+    test = reference.copy()
+    test[123, 1] += 2 * limit * reference[123, 1]
+    found = agreement(test, reference)
+    assert found.settings["worst"] == 123
+    assert names(found.gates) == {"probe.agreement.max"}
+    test[7] = np.nan
+    found = agreement(test, reference)
+    assert names(found.gates) == {"probe.agreement.max", "probe.agreement.p999"}
+    assert "1 of 5000" in found.gates[0].detail
+    assert not agreement(reference * np.nan, reference).passed
+
+
+# --- gates on their own ----------------------------------------------------------------------------------
+
+
+def test_gate_without_a_measurement_fails():
+    found = judge("probe.agreement", {"p999": 0.0, "max": np.nan})
+    assert [gate.passed for gate in found] == [True, False]
+    assert judge("probe.agreement", {})[0].detail == "not measured"
+
+
+def test_gate_refuses_what_it_does_not_limit():
+    with pytest.raises(InputError, match="p42"):
+        judge("probe.agreement", {"p42": 0.0})
+    with pytest.raises(InputError, match="no limit"):
+        judge("chi2", {})
+
+
+def test_lower_limits():
+    limit = tolerance("metric.flip_opposites.min_mean")
+    assert judge("metric.flip_opposites", {"mean": limit})[0].passed
+    assert not judge("metric.flip_opposites", {"mean": limit - 1e-3})[0].passed
+
+
+def test_missing_reference_is_a_failure():
+    found = missing_reference("image.noise_free", "sphere.exr")
+    assert found
+    assert all(not gate.passed and "sphere.exr" in gate.detail for gate in found)
+    assert not Comparison({}, tuple(found)).passed
+    assert not Comparison({}).passed
+
+
+def test_every_gate_has_a_reason_and_finite_limits():
+    for key in gate_keys():
+        assert reason(key)
+        assert all(np.isfinite(limit) for limit in limits(gate_table(key)).values())
+
+
+def test_every_key_in_code_and_tests_exists():
+    """A mistyped key would fail only when its line runs."""
+    pattern = re.compile(r"\b(?:tolerance|reason)\(\s*[\"']([\w.]+)[\"']")
+    used = {
+        key
+        for folder in ("btfref", "tests", "mitsuba_plugins")
+        for path in sorted((ROOT / folder).rglob("*.py"))
+        if path != Path(__file__)
+        for key in pattern.findall(path.read_text("utf-8"))
+    }
+    assert used
+    for key in used:
+        assert reason(key)
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("[a]\nmax = 1.0", "reason"),
+        ('[a]\nreason = " "\nmax = 1.0', "reason"),
+        ("[a", "tolerances.toml"),
+        ('[a]\nreason = "x"\nmax = [1.0]', "a.max"),
+    ],
+)
+def test_broken_limits_are_refused(text, word):
+    with pytest.raises(InputError, match=re.escape(word)):
+        parse(text)
+
+
+@pytest.mark.parametrize(
+    "key", ["image", "image.noise_free", "image.noise_free.nothing", "image.noise_free.reason", "x"]
+)
+def test_unknown_tolerances_raise(key):
+    with pytest.raises(InputError):
+        tolerance(key)
+
+
+# --- pictures in files -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def picture(rng):
+    return (rng.random((9, 14, 3)) * [4, 1, 0.1]).astype(np.float32)
+
+
+def test_exr_round_trip_is_exact(tmp_path, picture):
+    picture[0, 0] = [np.nan, np.inf, -1]
+    save_image(tmp_path / "a.exr", picture, attributes={"comments": "a test"})
+    np.testing.assert_array_equal(load_image(tmp_path / "a.exr"), picture)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+    with pytest.raises(InputError, match="not finite"):
+        load_image(tmp_path / "a.exr", finite=True)
+
+
+def test_png_round_trip_is_within_half_a_step(tmp_path, picture):
+    display = Display(-2.0)
+    save_image(tmp_path / "a.png", picture, display=display)
+    error = Display().encoded(load_image(tmp_path / "a.png")) - display.encoded(picture)
+    assert np.abs(error).max() <= tolerance("metric.display_step.max")
+
+
+def test_png_reads_other_modes(tmp_path):
+    from PIL import Image
+
+    Image.fromarray(np.full((2, 3, 4), [255, 0, 0, 128], np.uint8), "RGBA").save(tmp_path / "rgba.png")
+    assert load_image(tmp_path / "rgba.png")[0, 0].tolist() == [1, 0, 0]
+    Image.fromarray(np.full((2, 3), 65535, np.uint16)).save(tmp_path / "deep.png")
+    assert load_image(tmp_path / "deep.png").tolist() == np.ones((2, 3, 3)).tolist()
+
+
+def test_exr_with_half_grey_and_windows(tmp_path):
+    import OpenEXR
+
+    grey = np.arange(6, dtype=np.float16).reshape(2, 3)
+    header = {
+        "dataWindow": (np.array([1, 2], np.int32), np.array([3, 3], np.int32)),
+        "displayWindow": (np.array([0, 0], np.int32), np.array([3, 4], np.int32)),
+    }
+    OpenEXR.File(header, {"Y": grey}).write(str(tmp_path / "grey.exr"))
+    image = load_image(tmp_path / "grey.exr")
+    assert image.shape == (5, 4, 3)
+    np.testing.assert_array_equal(image[2:4, 1:4, 1], grey)
+    assert np.count_nonzero(image) == 15
+    OpenEXR.File({}, {"depth": grey}).write(str(tmp_path / "depth.exr"))
+    with pytest.raises(InputError, match="depth"):
+        load_image(tmp_path / "depth.exr")
+
+
+@pytest.mark.parametrize("ending", [".exr", ".png"])
+@pytest.mark.parametrize("damage", ["missing", "empty", "foreign", "truncated"])
+def test_unreadable_pictures_are_one_clear_line(tmp_path, picture, ending, damage):
+    path = tmp_path / f"broken{ending}"
+    save_image(path, picture)
+    data = path.read_bytes()
+    if damage == "missing":
+        path.unlink()
+    else:
+        path.write_bytes(
+            {"empty": b"", "foreign": b"GIF89a not this", "truncated": data[: len(data) // 2]}[damage]
+        )
+    with pytest.raises(InputError, match="broken") as error:
+        load_image(path)
+    assert "\n" not in str(error.value)
+
+
+def test_nothing_is_written_for_bad_input(tmp_path, picture):
+    for path, image in (
+        (tmp_path / "a.gif", picture),
+        (tmp_path / "a.exr", picture[..., 0]),
+        (tmp_path / "none" / "a.exr", picture),
+        (tmp_path / "a.png", picture[:0]),
+    ):
+        with pytest.raises(InputError):
+            save_image(path, image)
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(InputError, match="kind"):
+        load_image(tmp_path / "a.gif")
+
+
+def test_a_failing_write_leaves_the_old_file(tmp_path, picture, monkeypatch):
+    path = tmp_path / "a.png"
+    save_image(path, picture)
+    before = path.read_bytes()
+
+    def fail(pixels):
+        raise MemoryError
+
+    monkeypatch.setattr("btfref.compare.png.encode_png", fail)
+    with pytest.raises(MemoryError):
+        save_image(path, picture * 2)
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.png"]

@@ -1,0 +1,411 @@
+"""Metrics against closed forms and against their libraries; statistics against simulated noise."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from btfref.compare import colour, metrics, significance, tolerance
+from btfref.compare.flip import aces, exposure_range, flip_map, ldr_flip_map
+from btfref.errors import InputError
+
+
+def exact(expected):
+    return pytest.approx(
+        expected, rel=tolerance("metric.closed_form.rtol"), abs=tolerance("metric.closed_form.atol")
+    )
+
+
+def close(expected):
+    return pytest.approx(expected, rel=tolerance("metric.library.rtol"), abs=tolerance("metric.library.atol"))
+
+
+@pytest.fixture
+def pictures(rng):
+    """A test and a reference with structure, in [0, 1]."""
+    y, x = np.mgrid[0:40, 0:48] / 7.0
+    reference = np.clip(0.5 + 0.4 * np.sin(x)[..., None] * np.cos(y[..., None] * [1.0, 1.3, 0.7]), 0, 1)
+    return np.clip(reference + 0.05 * rng.standard_normal(reference.shape), 0, 1), reference
+
+
+def test_errors_of_a_constant_offset():
+    r = np.full((4, 5, 3), 0.25)
+    t = r + 0.5
+    assert metrics.bias(t, r) == exact(0.5)
+    assert metrics.mae(t, r) == exact(0.5)
+    assert metrics.rmse(t, r) == exact(0.5)
+    assert metrics.nrmse(t, r) == exact(2.0)
+    assert metrics.bias_fraction(r, t) == exact(2 / 3)
+    assert metrics.relmse(t, r, epsilon=0.01) == exact(0.25 / 0.0725)
+    assert metrics.smape(t, r, epsilon=0.0) == exact(1.0)
+    assert metrics.psnr(t, r, peak=5.0) == exact(20.0)
+
+
+def test_errors_of_two_values():
+    t, r = np.array([1.0, 3.0]), np.array([2.0, 0.0])
+    assert metrics.bias(t, r) == exact(1.0)
+    assert metrics.mae(t, r) == exact(2.0)
+    assert metrics.rmse(t, r) == exact(np.sqrt(5.0))
+    assert metrics.relmse(t, r, epsilon=1.0) == exact((1 / 5 + 9 / 1) / 2)
+    assert metrics.smape(t, r, epsilon=1.0) == exact((2 / 4 + 6 / 4) / 2)
+
+
+def test_equal_pictures():
+    r = np.zeros((3, 3, 3))
+    assert metrics.psnr(r, r, peak=1.0) == np.inf
+    assert metrics.nrmse(r, r) == 0
+    assert metrics.nrmse(r + 1, r) == np.inf
+
+
+def test_errors_accumulate_in_float64(rng):
+    r = np.full(2_000_000, 1e4, np.float32)
+    assert metrics.bias(r + np.float32(0.5), r) == exact(0.5)
+
+
+def test_metrics_equal_scikit_image(pictures):
+    from skimage import metrics as library
+
+    t, r = pictures
+    assert metrics.rmse(t, r) ** 2 == close(library.mean_squared_error(r, t))
+    assert metrics.psnr(t, r, peak=0.8) == close(library.peak_signal_noise_ratio(r, t, data_range=0.8))
+    _, expected = library.structural_similarity(
+        r,
+        t,
+        data_range=1.0,
+        channel_axis=-1,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,
+    )
+    np.testing.assert_allclose(
+        metrics.ssim_map(t, r),
+        expected,
+        rtol=tolerance("metric.library.rtol"),
+        atol=tolerance("metric.library.atol"),
+    )
+
+
+def test_ssim_of_constants():
+    t, r, c1 = 0.6, 0.2, 1e-4
+    expected = (2 * t * r + c1) / (t * t + r * r + c1)
+    found = metrics.ssim_map(np.full((16, 16, 1), t), np.full((16, 16, 1), r))
+    np.testing.assert_allclose(found, expected, rtol=tolerance("metric.library.rtol"))
+
+
+def test_ssim_of_a_picture_smaller_than_the_window():
+    assert metrics.ssim_map(np.full((2, 3, 3), 0.5), np.full((2, 3, 3), 0.5)).min() == exact(1.0)
+
+
+def test_relative_error_has_a_floor():
+    t, r = np.array([1.1, 0.01, 0.0, 5e-4]), np.array([1.0, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(
+        metrics.relative_error(t, r, floor=1e-2),
+        [0.1, 1.0, 0.0, 0.05],
+        rtol=tolerance("metric.closed_form.rtol"),
+    )
+    assert metrics.relative_error(np.ones(1), np.zeros(1)) == np.inf
+    assert metrics.relative_error(np.zeros(1), np.zeros(1)) == 0
+
+
+def test_percentiles_are_entries():
+    found = metrics.percentiles(np.arange(1, 1001)[::-1])
+    assert found == {"p50": 500.0, "p99": 990.0, "p999": 999.0, "max": 1000.0}
+    assert metrics.percentiles([3.0]) == {"p50": 3.0, "p99": 3.0, "p999": 3.0, "max": 3.0}
+
+
+@given(hnp.arrays(np.float64, st.integers(1, 300), elements=st.floats(0, 1e6)))
+@settings(deadline=None, derandomize=True, max_examples=50)
+def test_percentiles_are_ordered_and_bound_their_share(error):
+    found = metrics.percentiles(error)
+    assert found["p50"] <= found["p99"] <= found["p999"] <= found["max"] == error.max()
+    for name, share in metrics.PERCENTILES.items():
+        assert np.count_nonzero(error <= found[name]) >= np.ceil(error.size * share / 100 - 1e-9)
+
+
+@pytest.mark.parametrize("shape", [(3, 3, 3), (4, 3), (0,)])
+def test_shapes_must_agree_and_hold_something(shape):
+    other = (4, 3, 3) if shape != (0,) else shape
+    with pytest.raises(InputError, match="shape"):
+        metrics.rmse(np.zeros(shape), np.zeros(other))
+
+
+def test_psnr_wants_a_peak():
+    with pytest.raises(InputError, match="peak"):
+        metrics.psnr(np.ones(3), np.ones(3), peak=0.0)
+
+
+# --- colour ----------------------------------------------------------------------------------------------
+
+
+def test_ciede2000_equals_the_published_pairs(reference_file):
+    pairs = np.loadtxt(reference_file("ciede2000_sharma2005.csv"), delimiter=",")
+    assert pairs.shape == (34, 7)
+    limit = tolerance("metric.sharma.max")
+    assert np.abs(colour.ciede2000(pairs[:, :3], pairs[:, 3:6]) - pairs[:, 6]).max() <= limit
+    assert np.abs(colour.ciede2000(pairs[:, 3:6], pairs[:, :3]) - pairs[:, 6]).max() <= limit
+
+
+def test_ciede2000_equals_scikit_image(rng):
+    from skimage.color import deltaE_ciede2000
+
+    a, b = (rng.uniform([0, -100, -100], [100, 100, 100], (20000, 3)) for _ in range(2))
+    a[:50, 1:] = 0  # greys: no hue
+    np.testing.assert_allclose(
+        colour.ciede2000(a, b),
+        deltaE_ciede2000(a, b),
+        rtol=tolerance("metric.library.rtol"),
+        atol=tolerance("metric.library.atol"),
+    )
+
+
+def test_lab_equals_scikit_image_and_knows_white(rng):
+    from skimage.color import xyz2lab
+    from skimage.color.colorconv import xyz_from_rgb
+
+    rgb = rng.random((5000, 3))
+    expected = xyz2lab(rgb @ xyz_from_rgb.T, illuminant="D65", observer="2")
+    assert np.abs(colour.lab(rgb) - expected).max() <= tolerance("metric.lab.max")
+    np.testing.assert_allclose(colour.lab(np.ones(3)), [100, 0, 0], atol=tolerance("metric.library.atol"))
+    np.testing.assert_allclose(colour.lab(np.zeros(3)), [0, 0, 0], atol=tolerance("metric.closed_form.atol"))
+
+
+def test_luminance_is_the_middle_row_of_the_primaries():
+    np.testing.assert_allclose(
+        colour.RGB_TO_XYZ[1], colour.LUMINANCE, atol=tolerance("metric.luminance.atol")
+    )
+
+
+@given(st.floats(0, 1))
+@settings(deadline=None, derandomize=True)
+def test_srgb_round_trip(x):
+    assert colour.decode_srgb(colour.encode_srgb(x)) == close(x)
+
+
+def test_srgb_known_values():
+    assert float(colour.encode_srgb(0.214041140482)) == close(0.5)
+    assert float(colour.encode_srgb(1.0)) == exact(1.0)
+
+
+def test_display_is_chosen_from_lit_pixels_of_the_reference():
+    picture = np.zeros((100, 100, 3))
+    picture[:10] = 0.225
+    display = colour.fit_display(picture)
+    assert display.stops == 2.0
+    np.testing.assert_allclose(display.linear(picture).max(), 0.9, rtol=tolerance("metric.closed_form.rtol"))
+    assert colour.fit_display(np.zeros((2, 2, 3))).stops == 0.0
+    assert np.isfinite(display.encoded(np.array([np.nan, np.inf, -1.0]))).all()
+
+
+def test_delta_e_of_equal_pictures_is_zero_and_grows_with_the_error(pictures):
+    t, r = pictures
+    display = colour.Display()
+    assert colour.delta_e00(r, r, display).max() == 0
+    near = colour.delta_e00(0.5 * (t + r), r, display).mean()
+    assert 0 < near < colour.delta_e00(t, r, display).mean()
+
+
+# --- FLIP ------------------------------------------------------------------------------------------------
+
+
+def test_hdr_flip_is_the_largest_ldr_flip_over_the_exposures(rng):
+    r = 3 * rng.random((48, 56, 3))
+    t = r * rng.uniform(0.7, 1.3, r.shape)
+    found, used = flip_map(t, r, start=-3.0, stop=1.0, exposures=5)
+    expected = np.max(
+        [ldr_flip_map(aces(t * 2.0**c), aces(r * 2.0**c)) for c in np.linspace(-3.0, 1.0, 5)], axis=0
+    )
+    np.testing.assert_allclose(found, expected, atol=tolerance("metric.flip.atol"))
+    assert used["startExposure"] == -3.0
+    assert used["numExposures"] == 5
+    assert used["tonemapper"] == "aces"
+
+
+def test_exposures_are_those_of_the_library_for_a_picture_without_background(rng):
+    from flip_evaluator import evaluate
+
+    r = (0.1 + rng.random((64, 64, 3)) * 4).astype(np.float32)
+    _, _, used = evaluate(r, r, "HDR", applyMagma=False, computeMeanError=False, parameters={})
+    start, stop, exposures = exposure_range(r)
+    step = tolerance("metric.flip_exposure.stops")
+    assert abs(start - used["startExposure"]) <= step
+    assert abs(stop - used["stopExposure"]) <= step
+    assert exposures == used["numExposures"]
+    framed = np.zeros((256, 256, 3))
+    framed[96:160, 96:160] = r
+    assert exposure_range(framed) == (start, stop, exposures)
+
+
+def test_flip_of_equal_pictures_is_zero_and_of_opposites_large():
+    white = np.ones((32, 32, 3))
+    assert ldr_flip_map(white, white).max() == 0
+    assert ldr_flip_map(0 * white, white).mean() > tolerance("metric.flip_opposites.min_mean")
+    assert flip_map(white, white)[0].max() == 0
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"tonemapper": "filmic"},
+        {"pixels_per_degree": 0.0},
+        {"pixels_per_degree": np.nan},
+        {"start": 2.0, "stop": 1.0},
+        {"exposures": 1},
+        {"start": np.inf},
+    ],
+)
+def test_flip_refuses_what_would_end_the_process(change):
+    with pytest.raises(InputError):
+        flip_map(np.ones((4, 4, 3)), np.ones((4, 4, 3)), **change)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_flip_refuses_values_that_are_not_finite(value):
+    picture = np.ones((4, 4, 3))
+    picture[1, 2, 0] = value
+    with pytest.raises(InputError, match="finite"):
+        flip_map(picture, np.ones((4, 4, 3)))
+    with pytest.raises(InputError):
+        ldr_flip_map(picture, np.ones((4, 4, 3)))
+
+
+# --- statistics ------------------------------------------------------------------------------------------
+
+
+def test_sidak():
+    assert significance.sidak(0.05, 1) == exact(0.05)
+    assert 1 - (1 - significance.sidak(0.05, 1000)) ** 1000 == close(0.05)
+    with pytest.raises(InputError):
+        significance.sidak(0.0, 3)
+
+
+def test_welch_equals_scipy(rng):
+    from scipy import stats
+
+    a, b = rng.normal(0, 1, (9, 200)), rng.normal(0.3, 2, (14, 200))
+    expected = stats.ttest_ind(a, b, equal_var=False)
+    statistic, p = significance.welch_test(
+        a.mean(0), a.var(0, ddof=1) / 9, b.mean(0), b.var(0, ddof=1) / 14, n_a=9, n_b=14
+    )
+    np.testing.assert_allclose(statistic, expected.statistic, rtol=tolerance("metric.library.rtol"))
+    np.testing.assert_allclose(p, expected.pvalue, rtol=tolerance("metric.library.rtol"))
+
+
+def test_exact_values_are_equal_or_not():
+    statistic, p = significance.welch_test([1.0, 1.0], 0.0, [1.0, 1.5], 0.0)
+    assert p.tolist() == [1.0, 0.0]
+    assert statistic.tolist() == [0.0, -np.inf]
+    with pytest.raises(InputError, match="variance"):
+        significance.welch_test([1.0], -1.0, [1.0], 0.0)
+
+
+def test_p_values_of_equal_means_are_uniform_and_a_bias_is_found(rng):
+    level, slack = (
+        tolerance("significance.calibration.significance_parameter"),
+        tolerance("significance.calibration.max_deviation"),
+    )
+    truth = rng.uniform(1, 2, 2000)
+    t, r = truth + 0.1 * rng.standard_normal(2000), truth + 0.2 * rng.standard_normal(2000)
+    _, p = significance.welch_test(t, 0.01, r, 0.04)
+    assert abs(np.mean(p < level) - level) <= slack
+    assert abs(np.mean(p < 0.5) - 0.5) <= tolerance("significance.calibration.max_deviation_at_half")
+    assert significance.difference_test(p, significance=level).rejected == 0
+    t[7] += 2.0
+    found = significance.difference_test(significance.welch_test(t, 0.01, r, 0.04)[1], significance=level)
+    assert found.rejected == 1
+    assert found.rejected_fraction == exact(1 / 2000)
+
+
+def test_families_err_as_often_as_they_say(rng):
+    level, slack = (
+        tolerance("significance.calibration.significance_parameter"),
+        tolerance("significance.calibration.max_deviation"),
+    )
+    noise = rng.standard_normal((2000, 64))
+    rejected = [
+        significance.difference_test(
+            significance.welch_test(row, 1.0, 0 * row, 0.0)[1], significance=level
+        ).rejected
+        for row in noise
+    ]
+    assert abs(np.mean(np.array(rejected) > 0) - level) <= slack
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.02, 0.2])
+def test_intervals_hold_the_truth_as_often_as_they_say(rng, bias):
+    level, slack = (
+        tolerance("significance.calibration.significance_parameter"),
+        tolerance("significance.calibration.max_deviation"),
+    )
+    truth = bias * np.where(np.arange(400) % 2, 1.0, -0.5)
+    sigma, hits, estimates = 0.07, {"mean": 0, "known": 0, "halves": 0}, []
+    for _ in range(2000):
+        halves = truth + sigma * np.sqrt(2) * rng.standard_normal((2, 400))
+        found = {
+            "mean": (
+                significance.bias_interval(halves.mean(0), sigma**2, confidence=1 - level),
+                truth.mean(),
+            ),
+            "known": (
+                significance.mse_interval(halves.mean(0), sigma**2, confidence=1 - level),
+                np.mean(truth**2),
+            ),
+            "halves": (
+                significance.mse_interval_from_halves(*halves, confidence=1 - level),
+                np.mean(truth**2),
+            ),
+        }
+        estimates.append([found["known"][0].estimate, found["halves"][0].estimate])
+        for name, (interval, expected) in found.items():
+            hits[name] += interval.low <= expected <= interval.high
+    for name, count in hits.items():
+        assert abs(count / 2000 - (1 - level)) <= slack, name
+    standard_error = np.std(estimates, axis=0) / np.sqrt(2000)
+    assert (
+        np.abs(np.mean(estimates, axis=0) - np.mean(truth**2))
+        <= tolerance("significance.calibration.z") * standard_error
+    ).all()
+
+
+def test_rmse_interval_is_never_negative():
+    found = significance.rmse_interval(significance.interval(-0.01, 0.02))
+    assert found.low == found.estimate == 0
+    assert found.high > 0
+    assert found.standard_error > 0
+
+
+@pytest.mark.parametrize(
+    ("estimate", "error", "outcome"),
+    [
+        (0.0, 0.1, "pass"),
+        (0.5, 0.1, "pass"),
+        (0.9, 0.1, "inconclusive"),
+        (0.0, 10.0, "inconclusive"),
+        (2.0, 0.1, "fail"),
+        (-2.0, 0.1, "fail"),
+    ],
+)
+def test_equivalence_has_three_outcomes(estimate, error, outcome):
+    found = significance.equivalence_test(significance.interval(estimate, error), tolerance=1.0)
+    assert found.outcome == outcome
+    assert found.passed == (outcome == "pass")
+
+
+def test_equivalence_refuses_nonsense():
+    with pytest.raises(InputError):
+        significance.equivalence_test(significance.interval(0.0, 1.0), tolerance=0.0)
+    with pytest.raises(InputError):
+        significance.equivalence_test(significance.interval(0.0, np.inf), tolerance=1.0)
+
+
+def test_tiles_average_what_counts(rng):
+    picture = rng.random((11, 17, 3))
+    mask = np.ones((11, 17), bool)
+    mask[:8, 8:16] = False
+    mask[0, 0] = False
+    means, variances = significance.tile_means(picture, np.full(picture.shape, 0.5), mask, size=8)
+    assert means.shape == (5, 3)  # six tiles, one of them masked
+    block = picture[:8, :8][mask[:8, :8]]
+    np.testing.assert_allclose(means[0], block.mean(0), rtol=tolerance("metric.library.rtol"))
+    np.testing.assert_allclose(variances[0], 0.5 / 63, rtol=tolerance("metric.library.rtol"))
