@@ -9,9 +9,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-#: Half floats are widened by moving their bits into those of a float32 and multiplying by 2^112, which makes up for
-#: the different exponent biases; exact for normal and subnormal values.
-HALF_SCALE = 2.0**112
+#: Half tables are multiplied by this power of two when they are packed: the smallest subnormal half becomes normal.
+HALF_SHIFT = 2.0**10
+
+#: Largest value of a half table that survives the shift.
+HALF_LIMIT = 65504 / HALF_SHIFT
+
+#: Packed halves are widened by moving their bits into those of a float32; this makes up for the different exponent
+#: biases (2^112) and the shift. Exact for normal halves; CPUs in flush-to-zero mode would lose subnormal ones.
+HALF_SCALE = 2.0**112 / HALF_SHIFT
 
 
 def valid_directions(w):
@@ -19,25 +25,52 @@ def valid_directions(w):
     return (w.z > 0) & (dr.squared_norm(w) < 4)
 
 
+#: π/4 as a sum of two float32: differences to a tabulated angle keep float accuracy.
+QUARTER_PI = (0.785398185253143310546875, -2.18556948040e-8)
+
+
+def angle_of(y, x):
+    """Angle of (x, y) as a multiple of an eighth turn in [0, 8] plus a remainder of at most π/8 in magnitude.
+
+    The sum of the two would be rounded to a float32 of magnitude 2π; steps between directions multiply that error.
+    ``dr.atan2`` is good to 8e-7, this to 6e-8.
+    """
+    ax, ay = dr.abs(x), dr.abs(y)
+    small, large = dr.minimum(ax, ay), dr.maximum(ax, ay)
+    # Beyond tan(π/8) the remainder is taken from the diagonal: atan(s/l) = π/4 + atan((s − l)/(s + l)).
+    diagonal = small > 0.41421357 * large
+    q = dr.select(diagonal, small - large, small) / dr.maximum(dr.select(diagonal, small + large, large), 1e-37)
+    z = q * q
+    # Minimax fit of (atan(q)/q − 1)/q² on [0, tan(π/8)], relative error below 1e-9.
+    p = mi.Float(-0.060823050)
+    for coefficient in (0.10595571, -0.14243794, 0.19998487, -0.33333315):
+        p = dr.fma(p, z, coefficient)
+    rest = dr.fma(q * z, p, q)
+    eighths = dr.select(diagonal, mi.Float(1), 0)
+    for mask, turn in ((ay > ax, 2), (x < 0, 4), (y < 0, 8)):
+        eighths = dr.select(mask, turn - eighths, eighths)
+        rest = dr.select(mask, -rest, rest)
+    return eighths, rest
+
+
 def texel_stencil(uv, shape, filter_type):
-    """As :func:`btfref.conventions.texel_stencil`, for finite ``uv``: lists of indices and weights."""
+    """As :func:`btfref.conventions.texel_stencil`: lists of indices and weights."""
     rows, columns = shape
     size = mi.Vector2f(columns, rows)
     uv = dr.select(dr.isfinite(uv), uv, 0)
-    position = (uv - dr.floor(uv)) * size
+    # Far out the fraction is taken first, so that texel numbers stay exact; near 0 that would cost accuracy.
+    uv = dr.select(dr.abs(uv) > 1024, uv - dr.floor(uv), uv)
+    shift = 0.0 if filter_type == "nearest" else -0.5
+    low = dr.floor(dr.fma(uv, size, shift))
+    # One rounding, of a number in [0, 1): the integer part cancels inside the fused operation.
+    f = dr.clip(dr.fma(uv, size, shift - low), 0, 1)
+    low = low - size * dr.floor(low / size)
+    i0 = dr.minimum(mi.Vector2u(low), mi.Vector2u(columns - 1, rows - 1))
     if filter_type == "nearest":
-        i = dr.minimum(mi.Vector2u(position), mi.Vector2u(columns - 1, rows - 1))
-        return [i.y * columns + i.x], [mi.Float(1)]
-    # One rounding instead of two: the fraction is what is left after the integer part cancels.
-    position = dr.fma(uv - dr.floor(uv), size, -0.5)
-    low = dr.floor(position)
-    f = position - low
-    i0 = mi.Vector2i(low)
-    i0 = mi.Vector2i(dr.select(i0.x < 0, columns - 1, i0.x), dr.select(i0.y < 0, rows - 1, i0.y))
-    i0 = mi.Vector2i(dr.select(i0.x >= columns, 0, i0.x), dr.select(i0.y >= rows, 0, i0.y))
-    i1 = mi.Vector2i(dr.select(i0.x + 1 >= columns, 0, i0.x + 1), dr.select(i0.y + 1 >= rows, 0, i0.y + 1))
-    a, b = mi.Vector2u(i0), mi.Vector2u(i1)
-    index = [a.y * columns + a.x, a.y * columns + b.x, b.y * columns + a.x, b.y * columns + b.x]
+        return [i0.y * columns + i0.x], [mi.Float(1)]
+    i1 = i0 + 1
+    i1 = mi.Vector2u(dr.select(i1.x == columns, 0, i1.x), dr.select(i1.y == rows, 0, i1.y))
+    index = [i0.y * columns + i0.x, i0.y * columns + i1.x, i1.y * columns + i0.x, i1.y * columns + i1.x]
     weight = [(1 - f.x) * (1 - f.y), f.x * (1 - f.y), (1 - f.x) * f.y, f.x * f.y]
     return index, weight
 
@@ -72,8 +105,9 @@ class RingTable:
 
     def stencil(self, w, *, hold=True):
         """List of :class:`Neighbour`: one on the lower and one on the upper ring."""
-        theta = dr.atan2(dr.sqrt(dr.fma(w.x, w.x, w.y * w.y)), w.z)
-        turn = dr.atan2(w.y, w.x) * (0.5 / np.pi)
+        polar = angle_of(dr.sqrt(dr.fma(w.x, w.x, w.y * w.y)), w.z)
+        theta = dr.fma(polar[0], QUARTER_PI[0], polar[1])
+        eighths, rest = angle_of(w.y, w.x)
         last = len(self.rings) - 1
         # Tables this small are cheaper as chains of selects than as gathers.
         above = [theta >= float(ring[0]) for ring in self.rings[1:]]
@@ -90,7 +124,8 @@ class RingTable:
         high = np.minimum(low + 1, last)
         step = self.rings[high, 0] - self.rings[low, 0]
         inverse = np.where(step > 0, 1 / np.where(step > 0, step, 1), 0)
-        t = dr.clip((theta - choose(self.rings[low, 0])) * choose(inverse), 0, 1)
+        beyond = dr.fma(polar[0], QUARTER_PI[0], -choose(self.rings[low, 0])) + polar[0] * QUARTER_PI[1]
+        t = dr.clip((beyond + polar[1]) * choose(inverse), 0, 1)
         fade = mi.Float(1)
         edge = self.rings[last, 0]
         if not hold and np.cos(edge) > 1e-6:
@@ -98,10 +133,14 @@ class RingTable:
         neighbours = []
         for ring, share in ((low, (1 - t) * fade), (high, t * fade)):
             count = choose(self.rings[ring, 2])
-            position = (turn - choose(self.rings[ring, 1] / (2 * np.pi))) * count
-            position = dr.select(position < 0, position + count, position)
-            first = dr.clip(dr.floor(position), 0, count - 1)
-            fraction = dr.clip(position - first, 0, 1)
+            # Whole and fractional parts apart: a sum of magnitude ``count`` would round the fraction.
+            start = dr.fma(eighths, 0.125 * count, -choose(self.rings[ring, 1] / (2 * np.pi) * self.rings[ring, 2]))
+            whole = dr.floor(start)
+            position = dr.fma(rest, count * (0.5 / np.pi), start - whole)
+            carry = dr.floor(position)
+            fraction = dr.clip(position - carry, 0, 1)
+            first = whole + carry
+            first = first - count * dr.floor((first + 0.5) / count)
             following = dr.select(first + 1 < count, first + 1, 0)
             offset = choose(self.rings[ring, 3])
             neighbours.append(
@@ -203,9 +242,9 @@ class PairTable:
 
     Notes
     -----
-    Gathers dominate the cost, and their cost is the number of 32-bit words. Half tables on ring grids are therefore
-    kept as words that hold one value of a light and the same value of the next light on its ring: one word feeds two
-    of the four lights of a lookup. Such words are read sixteen (else four) at a time.
+    Gathers dominate the cost, and their cost is the number of 32-bit words. Half tables are therefore kept as words
+    of two values: on ring grids the same value of a light and of the next light on its ring, so that one entry feeds
+    two of the four lights of a lookup; elsewhere two neighbouring values of an entry.
     """
 
     def __init__(self, values, following):
@@ -215,17 +254,24 @@ class PairTable:
     def update(self, values):
         """Take new values; differentiable ones are kept as they are, so that gradients reach them."""
         self.outer, self.n_views, self.n_lights, self.width = values.shape
-        self.values = values.array
-        self.words = None
-        half = dr.type_v(self.values) == dr.VarType.Float16
-        if half and not dr.grad_enabled(self.values) and self.following is not None:
-            halves = np.asarray(values.numpy()).view(np.uint16)
+        self.words, self.values = None, values.array
+        if dr.type_v(self.values) != dr.VarType.Float16 or dr.grad_enabled(self.values):
+            return
+        halves = values.numpy()
+        if np.abs(halves).max() > HALF_LIMIT:
+            self.values = mi.Float(self.values)
+            dr.eval(self.values)
+            return
+        halves = (halves * np.float16(HALF_SHIFT)).view(np.uint16)
+        if self.following is None:
+            words = np.ascontiguousarray(halves).view(np.uint32)
+        else:
             words = halves[..., self.following, :].astype(np.uint32) << 16
             words |= halves
-            self.words = dr.reinterpret_array(mi.Float, mi.UInt32(words.ravel()))
-            dr.eval(self.words)
-            # The plain copy is only needed for gradients.
-            self.values = None
+        self.words = dr.reinterpret_array(mi.Float, mi.UInt32(words.ravel()))
+        dr.eval(self.words)
+        # The plain copy is only needed for gradients.
+        self.values = None
 
     def blend(self, outer, views, lights, active=True):
         """Interpolate over views and lights.
@@ -247,7 +293,7 @@ class PairTable:
             for view, view_weight in neighbour.single():
                 base = (outer * self.n_views + view) * self.n_lights
                 for light in lights:
-                    if self.words is not None:
+                    if self.words is not None and self.following is not None:
                         self._add_pair(total, base + light.index, view_weight, light, active)
                     else:
                         for index, weight in light.single():
@@ -258,14 +304,25 @@ class PairTable:
         low_weight = view_weight * light.weight * HALF_SCALE
         high_weight = view_weight * light.following_weight * HALF_SCALE
         for k, word in enumerate(read_packets(self.words, entry, self.width, active)):
-            word = dr.reinterpret_array(mi.UInt32, word)
-            low = dr.reinterpret_array(mi.Float, ((word << 13) & 0x0FFFE000) | ((word << 16) & 0x80000000))
-            high = dr.reinterpret_array(mi.Float, ((word >> 3) & 0x0FFFE000) | (word & 0x80000000))
+            low, high = widened(word)
             total[k] = dr.fma(high, high_weight, dr.fma(low, low_weight, total[k]))
 
     def _add_single(self, total, entry, weight, active):
-        for k, value in enumerate(read_packets(self.values, entry, self.width, active)):
+        if self.words is not None:
+            weight = weight * HALF_SCALE
+            values = [v for word in read_packets(self.words, entry, self.width // 2, active) for v in widened(word)]
+        else:
+            values = read_packets(self.values, entry, self.width, active)
+        for k, value in enumerate(values):
             total[k] = dr.fma(mi.Float(value), weight, total[k])
+
+
+def widened(word):
+    """The two halves of a word as float32, both to be multiplied by ``HALF_SCALE``."""
+    word = dr.reinterpret_array(mi.UInt32, word)
+    low = dr.reinterpret_array(mi.Float, ((word << 13) & 0x0FFFE000) | ((word << 16) & 0x80000000))
+    high = dr.reinterpret_array(mi.Float, ((word >> 3) & 0x0FFFE000) | (word & 0x80000000))
+    return low, high
 
 
 def read_packets(array, entry, width, active=True):
@@ -278,6 +335,9 @@ def read_packets(array, entry, width, active=True):
         if width % 16 == 0:
             packet = dr.gather(mi.Matrix4f, array, entry * (width // 16) + len(result) // 16, active)
             result += [packet[row, column] for row in range(4) for column in range(4)]
+        elif width % 4:
+            packet = dr.gather(mi.Vector2f, array, entry * (width // 2) + len(result) // 2, active)
+            result += [packet.x, packet.y]
         else:
             packet = dr.gather(mi.Vector4f, array, entry * (width // 4) + len(result) // 4, active)
             result += [packet[k] for k in range(4)]
