@@ -150,6 +150,9 @@ class Progress:
     Call it as ``progress(done, total, label)``; use it as a context manager so that the bar ends cleanly.
     """
 
+    #: Seconds before a bar is worth showing.
+    delay = 2.0
+
     def __init__(self):
         self._bar = None
 
@@ -167,7 +170,9 @@ class Progress:
             if self._bar is not None:
                 self._bar.close()
             # disable=None: no bar where nobody looks (standard error is a file or a pipe).
-            self._bar = tqdm(desc=label, total=total, delay=2.0, leave=False, disable=None, file=sys.stderr)
+            self._bar = tqdm(
+                desc=label, total=total, delay=self.delay, leave=False, disable=None, file=sys.stderr
+            )
             self._bar.desc = f"{label}: "
         self._bar.update(done - self._bar.n)
 

@@ -40,7 +40,7 @@ def lines(result):
     for cell in result.cells:
         failed = [gate.name for gate in cell.comparison.gates if not gate.passed]
         metrics = cell.comparison.metrics.get("interior") or cell.comparison.metrics["all"]
-        errors = [number(metrics.get(name)) for name in ("p999", "max")]
+        errors = [number(metrics.get(name)) for name in ("rel_p999", "rel_max")]
         rows.append([cell.name, *errors, f"FAIL {', '.join(failed)}" if failed else "pass"])
     yield from table(rows, header=["scene", "p99.9", "max", "gates"])
     yield ""

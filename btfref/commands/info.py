@@ -80,11 +80,10 @@ def _plain_exr(path):
 def _exr(path):
     headers = _headers(path)
     low, high = (corner.tolist() for corner in headers[0]["dataWindow"])
-    channels = [{"name": channel.name, "type": str(channel.type())} for channel in headers[0]["channels"]]
     return {
         "kind": "image",
         "size": [high[0] - low[0] + 1, high[1] - low[1] + 1],
-        "channels": [channel["name"] for channel in channels],
+        "channels": [channel.name for channel in headers[0]["channels"]],
         "parts": len(headers),
         "file_bytes": path.stat().st_size,
     }
@@ -109,14 +108,22 @@ def lines(facts, indent=""):
     for key, fact in facts.items():
         if key == "attributes":  # what matters of them stands above; --json has them all
             continue
-        if isinstance(fact, dict) and fact:
+        if isinstance(fact, dict) and fact and not _short(fact):
             yield f"{indent}{key}"
             yield from lines(fact, indent + "  ")
         else:
             yield f"{indent}{key:<{width}}  {_text(key, fact)}"
 
 
+def _short(fact):
+    """Whether a nested fact (a map, a direction set) fits one line."""
+    return set(fact) in ({"dtype", "shape"}, {"name", "count"})
+
+
 def _text(key, fact):
+    if isinstance(fact, dict) and fact:
+        shape = fact.get("shape")
+        return f"{fact['dtype']}  {_text('shape', shape)}" if shape else f"{fact['name']} ({fact['count']})"
     if key in _BYTES and fact is not None:
         return bytes_text(fact)
     if key == "ratio" and fact is not None:
