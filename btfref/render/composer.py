@@ -1,9 +1,10 @@
-"""The shader composer: strict nested includes, line numbers that survive, definitions made from a representation.
+"""The shader composer: strict nested includes, line numbers that survive, constants from a representation.
 
-A shader is put together from small files. ``#include "lib/table.glsl"`` is replaced by the text of that file, once:
-later includes of the same file are empty. Names are looked up in the given directories, then in the library
-(``shaders/``). The name ``representation`` stands for the file of the representation that is being shown. Anything
-else that looks like an include, an unknown name, or a cycle is an error, never a silent omission.
+A shader is put together from small files. ``#include "lib/table.glsl"`` is replaced by the text of that file,
+once: later includes of the same file are empty. Names are looked up in the given directories, then in the
+library (``shaders/``). The name ``representation`` stands for the file of the representation that is shown.
+Anything else that looks like an include, an unknown name, a cycle, or an include inside a conditional (which
+would hide the file from later includes) is an error, never a silent omission.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ TARGETS = {
 
 _INCLUDE = re.compile(r'^\s*#\s*include\s+"([^"\n]+)"\s*(?://.*)?$')
 _LOOKS_LIKE_INCLUDE = re.compile(r"^\s*#\s*include\b")
+_CONDITIONAL = re.compile(r"^\s*#\s*(if|endif)")
 _IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 # "0(12) : error", "0:12(5): error" (Mesa), "ERROR: 0:12:" (glslang)
 _LOCATION = re.compile(r"^(\s*(?:ERROR:\s*|WARNING:\s*)?)(\d+)([:(])(\d+)", re.MULTILINE)
@@ -92,7 +94,9 @@ def compose(name, defines=None, *, representation=None, directories=(), target="
         wanted = included
         if included == REPRESENTATION:
             if representation is None:
-                raise InputError("no representation was given for this include", file=asked_by, field=included)
+                raise InputError(
+                    "no representation was given for this include", file=asked_by, field=included
+                )
             wanted = str(representation)
         path = _find(wanted, search, asked_by)
         if path in stack:
@@ -104,15 +108,20 @@ def compose(name, defines=None, *, representation=None, directories=(), target="
         stack.append(path)
         number = len(files)
         files.append(wanted)
-        lines = [f"#line 1 {number}"]
+        lines, conditionals = [f"#line 1 {number}"], 0
         for position, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
-            match = _INCLUDE.match(line)
+            match, where = _INCLUDE.match(line), f"{wanted}:{position}"
+            conditional = _CONDITIONAL.match(line)
+            if conditional:
+                conditionals += 1 if conditional[1] == "if" else -1
+            if match and conditionals:
+                raise InputError("an include inside a conditional", file=where, got=line.strip())
             if match:
-                lines += [*expand(match[1], f"{wanted}:{position}"), f"#line {position + 1} {number}"]
+                lines += [*expand(match[1], where), f"#line {position + 1} {number}"]
             elif _LOOKS_LIKE_INCLUDE.match(line):
-                raise InputError("malformed include", file=f"{wanted}:{position}", got=line.strip(), expected='"…"')
+                raise InputError("malformed include", file=where, got=line.strip(), expected='"…"')
             elif re.match(r"^\s*#\s*version\b", line):
-                raise InputError("the composer writes the version line", file=f"{wanted}:{position}", got=line.strip())
+                raise InputError("the composer writes the version line", file=where, got=line.strip())
             else:
                 lines.append(line)
         stack.pop()
@@ -183,8 +192,8 @@ def _literal(name, value):
 def representation_defines(rep):
     """Constants that a representation's GLSL file may use.
 
-    For each array NAME of shape (a, b, …): ``NAME_DIM0 a``, ``NAME_DIM1 b``, … before padding, and ``NAME_STRIDE``,
-    the RGBA texels of one item of the port array's last axis; and every entry of ``rep.meta["constants"]``.
+    For each array NAME of shape (a, b, …): ``NAME_DIM0 a``, ``NAME_DIM1 b``, … before padding, and
+    ``NAME_STRIDE``, the RGBA texels of one item of the port array's last axis; and every entry of ``rep.meta["constants"]``.
 
     Parameters
     ----------

@@ -1,12 +1,8 @@
 // Provides view_stencil and light_stencil: neighbours of a direction among the measured ones; directions_valid.
 // Expects the samplers view_rings or view_triangles and view_cells, the same for light_, and light_directions.
 
-#if defined(VIEW_RINGS_DIM0) || defined(LIGHT_RINGS_DIM0)
 #include "lib/rings.glsl"
-#endif
-#if defined(VIEW_TRIANGLES_DIM0) || defined(LIGHT_TRIANGLES_DIM0)
 #include "lib/triangles.glsl"
-#endif
 
 #ifdef VIEW_RINGS_DIM0
 uniform sampler2DArray view_rings;

@@ -1,0 +1,122 @@
+"""Pixel classes: where two renderers can be compared point by point, and where they cannot."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from btfref.render.reference import film_rays, grid_offsets, loaded
+
+BACKGROUND, INTERIOR, SILHOUETTE = 0, 1, 2
+
+#: Names by value, for reports.
+CLASSES = ("background", "interior", "silhouette")
+
+#: A step between neighbouring samples that leaves the tangent plane by more than this share of a pixel's footprint
+#: is an edge. A smooth surface of curvature κ leaves it by κ s²/2 (s the distance of the samples), which is far
+#: less; a fold in front of another surface leaves it by their distance.
+STEP = 0.25
+
+
+def pixel_classes(scene, *, parameters=None, size=None, grid=4, variant="llvm_ad_rgb"):
+    """Class of every pixel, from the primary hits of a regular sub-pixel grid.
+
+    A pixel is *silhouette* when samples of it or of its eight neighbours mix hit and miss or several shapes, when
+    the surface jumps in depth between two of them (a fold in front of the cloth itself), or when the view passes the
+    horizon of the shading normal, where B jumps to zero. There, two renderers may see different surfaces at the same
+    sample: rasterizers snap vertices to 1/256 pixel. All other pixels that are hit are *interior*.
+
+    Parameters
+    ----------
+    scene : path-like or dict
+    parameters : dict of str to str, optional
+    size : (int, int), optional
+        Width and height in place of the scene's.
+    grid : int
+        n of the n × n samples.
+    variant : str
+        A JIT variant of Mitsuba.
+
+    Returns
+    -------
+    ndarray of uint8, shape (H, W)
+        0 background, 1 interior, 2 silhouette.
+    """
+    with loaded(scene, parameters, variant=variant, size=size) as made:
+        shape, point, normal, front, footprint = _hits(made, grid)
+    hit = shape > 0
+    edge = np.zeros(shape.shape, bool)
+    for axis in (0, 1):
+        a, b = (_part(shape.ndim, axis, part) for part in (slice(None, -1), slice(1, None)))
+        both = hit[a] & hit[b]
+        step = point[b] - point[a]
+        away = np.maximum(abs((normal[a] * step).sum(-1)), abs((normal[b] * step).sum(-1)))
+        differs = (shape[a] != shape[b]) | (both & (front[a] != front[b]))
+        differs |= both & (away > STEP * footprint[a])
+        edge[a] |= differs
+        edge[b] |= differs
+    pixels = (shape.shape[0] // grid, grid, shape.shape[1] // grid, grid)
+    any_edge = _spread(edge.reshape(pixels).any((1, 3)))
+    any_hit = hit.reshape(pixels).any((1, 3))
+    return np.where(any_edge, SILHOUETTE, np.where(any_hit, INTERIOR, BACKGROUND)).astype(np.uint8)
+
+
+def _part(ndim, axis, part):
+    index = [slice(None)] * ndim
+    index[axis] = part
+    return tuple(index)
+
+
+def _spread(mask):
+    """A mask grown by one pixel in all eight directions."""
+    padded = np.pad(mask, 1)
+    rows, columns = mask.shape
+    return np.any([padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3)], axis=0)
+
+
+def _hits(scene, grid):
+    """Primary hits on the fine grid.
+
+    Returns
+    -------
+    shape : ndarray of uint32, (H·n, W·n)
+        0 for a miss.
+    point, normal : ndarray of float32, (H·n, W·n, 3)
+        Normals are geometric.
+    front : ndarray of bool
+        Side of the shading normal that is seen.
+    footprint : ndarray of float32
+        Size of a pixel at the hit.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    sensor = scene.sensors()[0]
+    width, height = (int(k) for k in sensor.film().crop_size())
+    fine = (height, grid, width, grid)
+    made = {
+        "shape": np.zeros(fine, np.uint32),
+        "point": np.zeros((*fine, 3), np.float32),
+        "normal": np.zeros((*fine, 3), np.float32),
+        "front": np.zeros(fine, bool),
+        "footprint": np.zeros(fine, np.float32),
+    }
+    offsets = grid_offsets(grid)
+    for number, offset in enumerate(offsets):
+        ray, _ = film_rays(sensor, offset)
+        beside, _ = film_rays(sensor, (offset[0] + 1, offset[1]))
+        si = scene.ray_intersect(ray)
+        hit = si.is_valid()
+        values = {
+            "shape": dr.select(hit, dr.reinterpret_array(mi.UInt32, si.shape), 0),
+            "point": dr.select(hit, si.p, 0),
+            "normal": dr.select(hit, si.n, 0),
+            "front": si.wi.z > 0,
+            "footprint": dr.select(hit, si.t * dr.norm(ray.d - beside.d), 0),
+        }
+        dr.eval(values)
+        j, i = divmod(number, grid)
+        for name, value in values.items():
+            array = np.array(value)
+            array = array.T if array.ndim == 2 else array
+            made[name][:, j, :, i] = array.reshape(height, width, *array.shape[1:])
+    return [array.reshape(height * grid, width * grid, *array.shape[4:]) for array in made.values()]

@@ -1,0 +1,169 @@
+"""Mitsuba scenes as a tree of nodes: parsed once, with the same overrides for every renderer.
+
+Both renderers start from here, so that they agree on file names, film size and parameters.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from btfref.errors import InputError
+
+#: The BSDF plugin that shows a representation.
+BTF = "btf"
+
+
+@dataclass
+class ParsedScene:
+    """A parsed scene and what instantiates it.
+
+    Parameters
+    ----------
+    state : mitsuba.parser.ParserState
+    config : mitsuba.parser.ParserConfig
+    source : str
+        The scene file, or "scene dictionary".
+    """
+
+    state: object
+    config: object
+    source: str
+
+    @property
+    def nodes(self):
+        """All nodes, referenced by index."""
+        return self.state.nodes
+
+    def location(self, node):
+        """File and line of a node, for error messages."""
+        import mitsuba as mi
+
+        try:
+            return mi.parser.file_location(self.state, node) or self.source
+        except RuntimeError:
+            return self.source
+
+    def children(self, node):
+        """Nodes that ``node`` refers to, in their order, as ``(index, node)``."""
+        result = []
+        for key in node.props.keys():  # noqa: SIM118 - Properties iterates over keys only this way
+            value = node.props[key]
+            if type(value).__name__ == "ResolvedReference":
+                result.append((value.index(), self.nodes[value.index()]))
+        return result
+
+    def instantiate(self):
+        """The Mitsuba scene.
+
+        Raises
+        ------
+        InputError
+            With Mitsuba's reason in one line.
+        """
+        import mitsuba as mi
+
+        try:
+            made = mi.parser.instantiate(self.config, self.state)
+        except (RuntimeError, ValueError, TypeError) as error:
+            if isinstance(error.__cause__, InputError):
+                raise error.__cause__ from error
+            raise InputError(one_line(error), file=self.source) from error
+        return made[0] if isinstance(made, list) else made
+
+
+def one_line(error):
+    """Mitsuba's message without its C++ source positions."""
+    return " ".join(re.sub(r"\[[\w./]+\.(?:cpp|h):\d+\]\s*", "", str(error)).split())
+
+
+def use_variant(name):
+    """Make ``name`` the current Mitsuba variant.
+
+    Raises
+    ------
+    InputError
+        For a variant that this Mitsuba lacks.
+    """
+    import mitsuba as mi
+
+    if name not in mi.variants():
+        raise InputError("unknown Mitsuba variant", got=name, expected=", ".join(mi.variants()))
+    if mi.variant() != name:
+        mi.set_variant(name)
+
+
+def parse(scene, parameters=None, *, variant, size=None):
+    """Parse a scene for the current variant.
+
+    Parameters
+    ----------
+    scene : path-like or dict
+        Mitsuba XML file or scene dictionary.
+    parameters : dict of str to str, optional
+        Values for ``$name`` in the file.
+    variant : str
+        The current variant.
+    size : (int, int), optional
+        Width and height of the film in place of the scene's.
+
+    Returns
+    -------
+    ParsedScene
+        File names of ``btf`` materials are absolute: relative ones are looked up in the current directory, then
+        beside the scene file. Equal nodes and meshes are kept apart.
+
+    Raises
+    ------
+    InputError
+        For a missing or malformed file, unused or missing parameters, or a missing BTF file.
+    """
+    import mitsuba as mi
+
+    config = mi.parser.ParserConfig(variant)
+    config.merge_equivalent = False
+    config.merge_meshes = False
+    parameters = {key: str(value) for key, value in (parameters or {}).items()}
+    is_dict = isinstance(scene, dict)
+    source = "scene dictionary" if is_dict else str(scene)
+    if is_dict and parameters:
+        raise InputError("only scene files have parameters", field="parameters", got=", ".join(parameters))
+    if not is_dict and not Path(scene).is_file():
+        raise InputError("no such scene file", file=source)
+    try:
+        if is_dict:
+            state = mi.parser.parse_dict(config, scene)
+        else:
+            state = mi.parser.parse_file(config, str(scene), **parameters)
+        mi.parser.transform_all(config, state)
+    except (RuntimeError, ValueError, TypeError) as error:
+        raise InputError(one_line(error), file=source) from error
+    parsed = ParsedScene(state, config, source)
+    for node in parsed.nodes:
+        if node.props.plugin_name() == BTF:
+            _resolve_file(parsed, node, None if is_dict else Path(scene).resolve().parent)
+        elif _is(node, "Film") and size is not None:
+            node.props["width"], node.props["height"] = int(size[0]), int(size[1])
+    return parsed
+
+
+def _is(node, kind):
+    return str(node.type) == f"ObjectType.{kind}"
+
+
+def is_kind(node, kind):
+    """Whether a node is a "Shape", "BSDF", "Emitter", "Sensor", "Film", "Integrator"…"""
+    # In dictionaries, plugins that the current variant does not know come without a type.
+    return _is(node, kind) or (kind == "BSDF" and node.props.plugin_name() == BTF)
+
+
+def _resolve_file(parsed, node, beside):
+    name = node.props["filename"] if "filename" in node.props else None
+    if not isinstance(name, str) or not name:
+        raise InputError("a btf material without a file", file=parsed.location(node), field="filename")
+    for directory in (Path.cwd(), beside):
+        if directory is not None and (directory / name).is_file():
+            node.props["filename"] = str((directory / name).resolve())
+            return
+    raise InputError("no such BTF file", file=parsed.location(node), field="filename", got=name)

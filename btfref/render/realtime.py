@@ -1,0 +1,256 @@
+"""The real-time renderer: the same scene through GLSL, without a window.
+
+Direct light of directional and point lights without cast shadows. The sub-pixel grid is the one of the noise-free
+reference (:mod:`btfref.render.reference`): n × n regular samples a pixel, box filter. Each sample is one frame with
+a shifted projection; frames are added in float64.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from btfref.errors import InputError
+from btfref.render import gl
+from btfref.render.result import RenderResult
+from btfref.render.scene import SceneDescription, read_scene
+
+
+def realtime(scene, *, parameters=None, grid=4, size=None):
+    """Render a scene with OpenGL.
+
+    Parameters
+    ----------
+    scene : path-like, dict or SceneDescription
+    parameters : dict of str to str, optional
+        Values for ``$name`` in the file.
+    grid : int
+        n of the n × n sub-pixel samples, at (i + ½)/n.
+    size : (int, int), optional
+        Width and height in place of the scene's.
+
+    Returns
+    -------
+    RenderResult
+        ``meta["frame_ms"]`` is the median time of one frame (one sample a pixel), GPU timer and wall clock
+        whichever is longer; ``gl_vendor``, ``gl_renderer``, ``gl_version``; ``negative_fraction``, the share of
+        channels below zero, and ``not_finite``, their number: nothing is clamped.
+
+    Raises
+    ------
+    InputError
+        For a scene that cannot be read (see :func:`btfref.render.scene.read_scene`), without lights, or with a
+        shape that has no BTF.
+    MissingDependencyError
+        Without an OpenGL driver.
+    """
+    if grid < 1:
+        raise InputError("the sub-pixel grid needs a sample", field="grid", got=grid, expected="≥ 1")
+    if not isinstance(scene, SceneDescription):
+        scene = read_scene(scene, parameters, size=size)
+    with Renderer(scene) as renderer:
+        offsets = [((i + 0.5) / grid, (j + 0.5) / grid) for j in range(grid) for i in range(grid)]
+        total = np.zeros((scene.camera.height, scene.camera.width, 3))
+        times = []
+        for offset in offsets:
+            times.append(renderer.draw(offset))
+            total += renderer.read()
+        image = (total / len(offsets)).astype(np.float32)
+        meta = {
+            "renderer": "realtime",
+            "grid": grid,
+            "shadows": False,
+            "frame_ms": float(np.median(times)),
+            "negative_fraction": float((image < 0).mean()),
+            "not_finite": int((~np.isfinite(image)).sum()),
+            "triangles": sum(len(mesh.faces) for mesh in scene.meshes),
+            "lights": len(scene.lights),
+            **gl.facts(renderer.ctx),
+        }
+    return RenderResult(image, None, meta)
+
+
+class Renderer:
+    """A scene on the GPU; draws one sample a pixel at a time.
+
+    Parameters
+    ----------
+    scene : SceneDescription
+    load : callable, optional
+        ``path -> Representation``; the default reads the files.
+    """
+
+    def __init__(self, scene, load=None):
+        if not scene.lights:
+            raise InputError("the scene has no light", file=scene.source, field="emitter")
+        for mesh in scene.meshes:
+            if mesh.material is None:
+                where = f"{scene.source}: shape {mesh.name}"
+                raise InputError(
+                    "real-time rendering needs a btf material", file=where, field="bsdf", got=mesh.bsdf
+                )
+        if load is None:
+            from btfref.representations import load
+        self.ctx = gl.context()
+        self.camera = scene.camera
+        self._owned, self._shown, self._meshes = [], {}, []
+        size = (self.camera.width, self.camera.height)
+        limit = self.ctx.info["GL_MAX_RENDERBUFFER_SIZE"]
+        if max(size) > limit:
+            raise InputError(
+                "the image is too large for this driver",
+                field="size",
+                got=f"{size[0]}x{size[1]}",
+                expected=f"≤ {limit}",
+            )
+        colour = self._own(self.ctx.texture(size, 4, dtype="f4"))
+        self._target = self._own(self.ctx.framebuffer([colour], self._own(self.ctx.depth_renderbuffer(size))))
+        self._near, self._far = _clip(self.camera, scene.meshes)
+        self._lights = _light_uniforms(scene.lights)
+        try:
+            for mesh in scene.meshes:
+                self._add(mesh, load)
+        except BaseException:
+            self.release()
+            raise
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.release()
+
+    def _own(self, thing):
+        self._owned.append(thing)
+        return thing
+
+    def _add(self, mesh, load):
+        material = mesh.material
+        key = (material.filename, material.filter_type)
+        if key not in self._shown:
+            shown = gl.ShaderRepresentation.upload(
+                self.ctx, load(material.filename), filter_type=material.filter_type
+            )
+            defines = {"N_LIGHTS": len(self._lights["light_power"])}
+            program = shown.program(self.ctx, "hosts/mesh.vert", "hosts/mesh.frag", defines=defines)
+            self._own(program), self._own(shown)
+            self._shown[key] = shown, program, self._own(self.ctx.vertex_array(program, []))
+        table = self._own(gl.upload(self.ctx, triangle_table(mesh), "triangles"))
+        self._meshes.append((mesh, key, table))
+
+    def draw(self, offset=(0.5, 0.5)):
+        """Draw a frame; ``offset`` is the sample's place in each pixel, from the top left.
+
+        Returns
+        -------
+        float
+            Milliseconds: GPU timer or wall clock around it, whichever is longer.
+        """
+        ctx, camera = self.ctx, self.camera
+        self._target.use()
+        ctx.disable(ctx.BLEND | ctx.CULL_FACE)
+        ctx.enable(ctx.DEPTH_TEST)
+        self._target.clear(0.0, 0.0, 0.0, 0.0)
+        corner, right, down = camera.ray_basis()
+        common = {
+            "world_to_clip": world_to_clip(camera, offset, self._near, self._far).T,
+            "camera_origin": camera.origin,
+            "ray_corner": corner,
+            "ray_right": right,
+            "ray_down": down,
+            # gl_FragCoord is at pixel centres.
+            "film_offset": np.asarray(offset, float) - 0.5,
+            "film_height": float(camera.height),
+            **self._lights,
+        }
+        ctx.finish()
+        start = time.perf_counter()
+        query = ctx.query(time=True)
+        with query:
+            for mesh, key, table in self._meshes:
+                shown, program, vertices = self._shown[key]
+                gl.bind(program, {**shown.textures, "triangles": table})
+                row0, row1 = mesh.material.to_uv
+                own = {"uv_row0": row0, "uv_row1": row1, "scale": mesh.material.scale}
+                gl.set_uniforms(program, {**common, **own, "two_sided": mesh.material.twosided})
+                vertices.render(ctx.TRIANGLES, vertices=3 * len(mesh.faces))
+        ctx.finish()
+        return max(1e-6 * query.elapsed, 1e3 * (time.perf_counter() - start))
+
+    def read(self):
+        """The frame, float32 (H, W, 3), row 0 at the top."""
+        pixels = np.frombuffer(self._target.read(components=3, dtype="f4"), np.float32)
+        return pixels.reshape(self.camera.height, self.camera.width, 3)[::-1]
+
+    def release(self):
+        """Give everything on the GPU back."""
+        while self._owned:
+            self._owned.pop().release()
+
+
+def triangle_table(mesh):
+    """Triangles as ``shaders/lib/triangle_table.glsl`` reads them.
+
+    Parameters
+    ----------
+    mesh : MeshDescription
+
+    Returns
+    -------
+    ndarray of float32, shape (m, 7, 4)
+        Three positions with u, three normals with v, dp/du.
+    """
+    positions, normals, uv, dp_du = mesh.corners()
+    table = np.zeros((len(positions), 7, 4), np.float32)
+    table[:, 0:3, :3], table[:, 0:3, 3] = positions, uv[..., 0]
+    table[:, 3:6, :3], table[:, 3:6, 3] = normals, uv[..., 1]
+    # Only the direction counts; unit length keeps float32 far from overflow.
+    table[:, 6, :3] = dp_du / np.linalg.norm(dp_du, axis=-1, keepdims=True)
+    return table
+
+
+def world_to_clip(camera, offset, near, far):
+    """Projection that puts the film point at ``offset`` in each pixel on that pixel's centre.
+
+    Parameters
+    ----------
+    camera : Camera
+    offset : (float, float)
+        From the pixel's top left corner, in pixels.
+    near, far : float
+
+    Returns
+    -------
+    ndarray of float64, shape (4, 4)
+    """
+    to_world = camera.to_world.copy()
+    to_world[:3, :3] /= np.linalg.norm(to_world[:3, :3], axis=0)
+    tan_x, tan_y = camera.tangents
+    shift_x = 2 * (0.5 - offset[0]) / camera.width
+    shift_y = -2 * (0.5 - offset[1]) / camera.height
+    project = np.array(
+        [
+            # Mitsuba's camera space is left, up, forward.
+            [-1 / tan_x, 0, shift_x, 0],
+            [0, 1 / tan_y, shift_y, 0],
+            [0, 0, (far + near) / (far - near), -2 * far * near / (far - near)],
+            [0, 0, 1, 0],
+        ]
+    )
+    return project @ np.linalg.inv(to_world)
+
+
+def _clip(camera, meshes):
+    """Near and far planes around the scene: the depth buffer then resolves what is there."""
+    depths = [camera.depth(mesh.positions[mesh.faces.ravel()]) for mesh in meshes if len(mesh.faces)]
+    if not depths:
+        return camera.near, camera.far
+    low, high = min(d.min() for d in depths), max(d.max() for d in depths)
+    near = max(camera.near, 0.99 * low)
+    return near, max(min(camera.far, 1.01 * high), 1.01 * near)
+
+
+def _light_uniforms(lights):
+    position = [[*light.position, 0.0 if light.kind == "directional" else 1.0] for light in lights]
+    return {"light_position": np.array(position), "light_power": np.array([light.power for light in lights])}

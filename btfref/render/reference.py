@@ -1,0 +1,253 @@
+"""The reference renderer: Mitsuba with any integrator, and noise-free direct light of delta lights.
+
+The film is always float32 with a box filter, so that a pixel is the plain mean of its samples: Mitsuba's default
+Gaussian filter mixes pixels and its float16 files round.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from btfref.errors import InputError
+from btfref.render import parsing
+from btfref.render.result import RenderResult
+
+#: Independent renders whose spread gives the variance of the mean: 15 degrees of freedom.
+BATCHES = 16
+
+
+def render(
+    scene,
+    *,
+    parameters=None,
+    variant="llvm_ad_rgb",
+    spp=None,
+    seed=0,
+    noise_free=None,
+    shadows=True,
+    size=None,
+    with_variance=False,
+):
+    """Render a scene with Mitsuba.
+
+    Parameters
+    ----------
+    scene : path-like or dict
+        Mitsuba scene.
+    parameters : dict of str to str, optional
+        Values for ``$name`` in the file.
+    variant : str
+        Mitsuba variant.
+    spp : int, optional
+        Samples per pixel in place of the scene's.
+    seed : int
+        The same seed gives the same image on the same machine.
+    noise_free : int, optional
+        Direct light only, n × n regular sub-pixel samples at (i + ½)/n, the material evaluated towards each light:
+        nothing is random. Needs delta lights and a JIT variant; replaces integrator, sampler, spp and seed.
+    shadows : bool
+        False leaves cast shadows out (``noise_free`` only).
+    size : (int, int), optional
+        Width and height in place of the scene's.
+    with_variance : bool
+        Estimate the variance of the mean from independent renders of ``spp / 16`` samples each.
+
+    Returns
+    -------
+    RenderResult
+
+    Raises
+    ------
+    InputError
+        For scenes that Mitsuba cannot load, and lights that ``noise_free`` cannot handle.
+    MissingDependencyError
+        Without a usable LLVM for an llvm variant.
+    """
+    if noise_free is None and not shadows:
+        raise InputError("only the noise-free mode leaves shadows out", field="shadows", got=False)
+    for name, value in (("spp", spp), ("noise_free", noise_free)):
+        if value is not None and value < 1:
+            raise InputError("at least one sample is needed", field=name, got=value, expected="≥ 1")
+    with loaded(scene, parameters, variant=variant, size=size) as made:
+        start = time.perf_counter()
+        if noise_free is not None:
+            image, variance = _noise_free(made, noise_free, shadows), None
+            settings = {"noise_free": noise_free, "shadows": shadows, "integrator": "noise-free direct"}
+        else:
+            image, variance, settings = _monte_carlo(made, spp, seed, with_variance)
+        seconds = time.perf_counter() - start
+    facts = {"renderer": "mitsuba", "variant": variant, "rfilter": "box", "component_format": "float32"}
+    return RenderResult(image, variance, {**facts, **settings, "seconds": seconds, **_versions()})
+
+
+class loaded:  # noqa: N801 - a context manager that reads as a verb
+    """``with loaded(scene, parameters, variant=…, size=…) as mitsuba_scene``; restores the variant afterwards."""
+
+    def __init__(self, scene, parameters=None, *, variant="llvm_ad_rgb", size=None):
+        self._arguments = scene, parameters, variant, size
+        self._before = None
+
+    def __enter__(self):
+        scene, parameters, variant, size = self._arguments
+        if variant.startswith("llvm"):
+            from btfref.platform import prepare_llvm
+
+            prepare_llvm()
+        import mitsuba as mi
+
+        self._before = mi.variant()
+        parsing.use_variant(variant)
+        try:
+            if "scalar" not in variant:
+                import mitsuba_plugins
+
+                mitsuba_plugins.register()
+            parsed = parsing.parse(scene, parameters, variant=variant, size=size)
+            for node in parsed.nodes:
+                if parsing.is_kind(node, "Film"):
+                    _plain_film(parsed, node)
+            made = parsed.instantiate()
+            if not isinstance(made, mi.Scene):
+                raise InputError("the file does not describe a scene", file=parsed.source)
+            if not made.sensors():
+                raise InputError("the scene has no sensor", file=parsed.source, field="sensor")
+            return made
+        except BaseException:
+            self.__exit__()
+            raise
+
+    def __exit__(self, *_):
+        if self._before is not None:
+            parsing.use_variant(self._before)
+
+
+def _plain_film(parsed, film):
+    """Box filter and float32 RGB, whatever the scene says."""
+    import mitsuba as mi
+
+    film.props["component_format"] = "float32"
+    film.props["pixel_format"] = "rgb"
+    filters = [node for _, node in parsed.children(film) if parsing.is_kind(node, "ReconstructionFilter")]
+    if not filters:
+        node = mi.parser.SceneNode()
+        node.type = mi.ObjectType.ReconstructionFilter
+        node.props.set_plugin_name("box")
+        parsed.state.nodes.append(node)
+        film.props["rfilter"] = mi.Properties.ResolvedReference(len(parsed.nodes) - 1)
+    for node in filters:
+        for key in list(node.props.keys()):
+            del node.props[key]
+        node.props.set_plugin_name("box")
+
+
+def _monte_carlo(scene, spp, seed, with_variance):
+    import mitsuba as mi
+
+    spp = spp or int(scene.sensors()[0].sampler().sample_count())
+    integrator = scene.integrator()
+    settings = {
+        "seed": seed,
+        "integrator": integrator.class_name() if hasattr(integrator, "class_name") else "",
+    }
+
+    def once(count, number):
+        return np.array(mi.render(scene, spp=count, seed=number), np.float32)[..., :3]
+
+    if not with_variance:
+        return once(spp, seed), None, {**settings, "spp": spp}
+    if spp < 2:
+        raise InputError("a variance needs two samples per pixel", field="spp", got=spp, expected="≥ 2")
+    batches = min(BATCHES, spp)
+    count = -(-spp // batches)
+    seeds = np.random.SeedSequence(seed).generate_state(batches)
+    mean, square = 0.0, 0.0
+    for done, number in enumerate(seeds):
+        # Welford: the batches differ by little, sums of squares would lose it.
+        image = once(count, int(number)).astype(float)
+        change = image - mean
+        mean = mean + change / (done + 1)
+        square = square + change * (image - mean)
+    variance = (square / (batches - 1) / batches).astype(np.float32)
+    return mean.astype(np.float32), variance, {**settings, "spp": count * batches, "batches": batches}
+
+
+def film_rays(sensor, offset):
+    """Camera rays through the point ``offset`` of every pixel (from its top left corner), row by row.
+
+    Returns
+    -------
+    rays : mitsuba.Ray3f
+    weight : mitsuba.Spectrum
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    width, height = (int(n) for n in sensor.film().crop_size())
+    index = dr.arange(mi.UInt32, width * height)
+    x, y = mi.Float(index % width), mi.Float(index // width)
+    # The offset is data, not code: all sub-pixel samples share one kernel.
+    ox, oy = (dr.opaque(mi.Float, float(o)) for o in offset)
+    position = mi.Point2f((x + ox) / width, (y + oy) / height)
+    ray, weight = sensor.sample_ray(mi.Float(0), mi.Float(0.5), position, mi.Point2f(0.5))
+    return ray, weight
+
+
+def grid_offsets(n):
+    """Sub-pixel samples ((i + ½)/n, (j + ½)/n), row by row."""
+    return [((i + 0.5) / n, (j + 0.5) / n) for j in range(n) for i in range(n)]
+
+
+def _noise_free(scene, n, shadows):
+    """Mean over the grid of Σ over lights of incident power × ``bsdf.eval``; float32 (H, W, 3)."""
+    import drjit as dr
+    import mitsuba as mi
+
+    if not dr.is_jit_v(mi.Float):
+        raise InputError("the noise-free mode needs a JIT variant", field="variant", got=mi.variant())
+    delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
+    for emitter in scene.emitters():
+        if not int(emitter.flags()) & int(delta):
+            raise InputError(
+                "the noise-free mode needs delta lights",
+                field="emitter",
+                got=emitter.class_name(),
+                expected="point, directional…",
+            )
+    sensor = scene.sensors()[0]
+    width, height = (int(k) for k in sensor.film().crop_size())
+    total = np.zeros((3, width * height))
+    for offset in grid_offsets(n):
+        ray, weight = film_rays(sensor, offset)
+        total += np.array(weight * _direct(scene, ray, shadows), float)
+    return (total.T / n**2).reshape(height, width, 3).astype(np.float32)
+
+
+def _direct(scene, ray, shadows):
+    import drjit as dr
+    import mitsuba as mi
+
+    si = scene.ray_intersect(ray)
+    bsdf = si.bsdf(ray)
+    context = mi.BSDFContext()
+    emitters = scene.emitters_dr()
+
+    def body(i, sum_):
+        emitter = dr.gather(mi.EmitterPtr, emitters, i, si.is_valid())
+        sample, power = emitter.sample_direction(si, mi.Point2f(0.5), si.is_valid())
+        active = si.is_valid() & (sample.pdf > 0)
+        if shadows:
+            active &= ~scene.ray_test(si.spawn_ray_to(sample.p), active)
+        value = bsdf.eval(context, si, si.to_local(sample.d), active)
+        return i + 1, sum_ + dr.select(active, power * value, 0)
+
+    count = len(scene.emitters())
+    start = dr.zeros(mi.UInt32, dr.width(ray)), dr.zeros(mi.Spectrum, dr.width(ray))
+    return dr.while_loop(start, lambda i, _: i < count, body, labels=("light", "radiance"))[1]
+
+
+def _versions():
+    from btfref.versions import versions
+
+    return {"versions": versions()}

@@ -1,0 +1,26 @@
+"""What every renderer returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class RenderResult:
+    """A rendered image.
+
+    Parameters
+    ----------
+    image : ndarray of float32, shape (H, W, 3)
+        Linear Rec. 709 radiance, row 0 at the top.
+    variance : ndarray of float32, shape (H, W, 3), or None
+        Of the mean, per pixel and channel; None where nothing is random or it was not asked for.
+    meta : dict
+        JSON-able facts: renderer, settings, versions, times.
+    """
+
+    image: np.ndarray
+    variance: np.ndarray | None = None
+    meta: dict = field(default_factory=dict)

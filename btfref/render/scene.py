@@ -1,0 +1,272 @@
+"""Mitsuba scenes as plain data: camera, meshes, BTF materials, lights. The real-time renderer needs no more."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from btfref.errors import InputError
+from btfref.render import parsing
+from btfref.render.shapes import BtfMaterial, MeshDescription, triangles_of
+
+__all__ = ["BtfMaterial", "Camera", "Light", "MeshDescription", "SceneDescription", "read_scene"]
+
+#: Reading scenes loads no LLVM: this variant is compiled ahead of time.
+VARIANT = "scalar_rgb"
+
+LIGHTS = ("directional", "point")
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A perspective camera.
+
+    Parameters
+    ----------
+    to_world : ndarray, shape (4, 4)
+        Columns: left, up, forward, origin, as Mitsuba's look-at.
+    x_fov : float
+        Horizontal field of view in radians.
+    width, height : int
+        Of the film in pixels.
+    near, far : float
+        Clipping distances along the optical axis.
+    """
+
+    to_world: np.ndarray
+    x_fov: float
+    width: int
+    height: int
+    near: float
+    far: float
+
+    @property
+    def origin(self):
+        """Position in world space, shape (3,)."""
+        return self.to_world[:3, 3]
+
+    @property
+    def tangents(self):
+        """Half extents of the image at distance 1: horizontal, vertical."""
+        x = np.tan(0.5 * self.x_fov)
+        return x, x * self.height / self.width
+
+    def ray_basis(self):
+        """Directions of film points: ``corner + x · right + y · down`` for pixel coordinates from the top left.
+
+        Returns
+        -------
+        corner, right, down : ndarray of float64, shape (3,)
+            Not normalised: the component along the optical axis is 1.
+        """
+        left, up, forward = (self.to_world[:3, i] / np.linalg.norm(self.to_world[:3, i]) for i in range(3))
+        tan_x, tan_y = self.tangents
+        corner = forward + tan_x * left + tan_y * up
+        return corner, -2 * tan_x / self.width * left, -2 * tan_y / self.height * up
+
+    def depth(self, points):
+        """Distances of points along the optical axis, shape (..., 3) -> (...)."""
+        forward = self.to_world[:3, 2] / np.linalg.norm(self.to_world[:3, 2])
+        return (points - self.origin) @ forward
+
+
+@dataclass(frozen=True)
+class Light:
+    """A delta light.
+
+    Parameters
+    ----------
+    kind : {"directional", "point"}
+    position : ndarray, shape (3,)
+        Unit vector *towards* a directional light; position of a point light.
+    power : ndarray, shape (3,)
+        Irradiance on a plane that faces the light in W/m², or radiant intensity in W/sr; linear RGB.
+    """
+
+    kind: str
+    position: np.ndarray
+    power: np.ndarray
+
+
+@dataclass(frozen=True)
+class SceneDescription:
+    """A scene as data.
+
+    Parameters
+    ----------
+    camera : Camera
+    meshes : tuple of MeshDescription
+    lights : tuple of Light
+    source : str
+        The scene file, for messages.
+    """
+
+    camera: Camera
+    meshes: tuple[MeshDescription, ...]
+    lights: tuple[Light, ...]
+    source: str
+
+
+def read_scene(scene, parameters=None, *, size=None):
+    """Read a Mitsuba scene.
+
+    Parameters
+    ----------
+    scene : path-like or dict
+    parameters : dict of str to str, optional
+        Values for ``$name`` in the file.
+    size : (int, int), optional
+        Width and height of the film in place of the scene's.
+
+    Returns
+    -------
+    SceneDescription
+
+    Raises
+    ------
+    InputError
+        In one line with file and field: missing or malformed files, no or several sensors, a camera that is not
+        ``perspective`` or is cropped, a light or shape of an unsupported kind, a shape without texture
+        coordinates, a missing BTF file.
+    """
+    import mitsuba as mi
+
+    before = mi.variant()
+    parsing.use_variant(VARIANT)
+    try:
+        parsed = parsing.parse(scene, parameters, variant=VARIANT, size=size)
+        roots = parsed.children(parsed.state.root)
+        nodes = {
+            kind: [n for _, n in roots if parsing.is_kind(n, kind)] for kind in ("Sensor", "Emitter", "Shape")
+        }
+        _check(parsed, nodes)
+        materials = [_material(parsed, node) for node in nodes["Shape"]]
+        _plain(parsed)
+        made = parsed.instantiate()
+        if not isinstance(made, mi.Scene) or len(made.shapes()) != len(nodes["Shape"]):
+            raise InputError("the file does not describe one scene of separate shapes", file=parsed.source)
+        meshes = []
+        for shape, node, (bsdf, material) in zip(made.shapes(), nodes["Shape"], materials, strict=True):
+            data = triangles_of(shape, node, file=parsed.location(node))
+            name, plugin = shape.id(), node.props.plugin_name()
+            meshes.append(MeshDescription(name=name, plugin=plugin, bsdf=bsdf, material=material, **data))
+        lights = [
+            _light(n.props.plugin_name(), e) for n, e in zip(nodes["Emitter"], made.emitters(), strict=True)
+        ]
+        return SceneDescription(_camera(made.sensors()[0]), tuple(meshes), tuple(lights), parsed.source)
+    finally:
+        if before is not None:
+            parsing.use_variant(before)
+
+
+def _check(parsed, nodes):
+    if len(nodes["Sensor"]) != 1:
+        raise InputError(
+            "one sensor is needed", file=parsed.source, field="sensor", got=len(nodes["Sensor"]), expected=1
+        )
+    sensor = nodes["Sensor"][0]
+    if sensor.props.plugin_name() != "perspective":
+        where, got = parsed.location(sensor), sensor.props.plugin_name()
+        raise InputError("unsupported sensor", file=where, field="sensor", got=got, expected="perspective")
+    for key in ("principal_point_offset_x", "principal_point_offset_y"):
+        if key in sensor.props and float(sensor.props[key]) != 0:
+            raise InputError(
+                "unsupported sensor setting", file=parsed.location(sensor), field=key, expected=0
+            )
+    for _, film in parsed.children(sensor):
+        for key in ("crop_width", "crop_height", "crop_offset_x", "crop_offset_y"):
+            if parsing.is_kind(film, "Film") and key in film.props:
+                raise InputError("cropped films are not supported", file=parsed.location(film), field=key)
+    for node in nodes["Emitter"]:
+        if node.props.plugin_name() not in LIGHTS:
+            where, got = parsed.location(node), node.props.plugin_name()
+            raise InputError(
+                "unsupported light", file=where, field="emitter", got=got, expected=" or ".join(LIGHTS)
+            )
+    for node in nodes["Shape"]:
+        for _, child in parsed.children(node):
+            if parsing.is_kind(child, "Emitter"):
+                where, got = parsed.location(child), child.props.plugin_name()
+                raise InputError(
+                    "unsupported light", file=where, field="emitter", got=got, expected=" or ".join(LIGHTS)
+                )
+    for node in parsed.nodes:
+        # Objects that were made before cannot be read under another variant.
+        for key, value in node.props.items():
+            if type(value).__module__.startswith("mitsuba") and hasattr(value, "class_name"):
+                raise InputError("the scene holds a finished Mitsuba object", file=parsed.source, field=key)
+
+
+def _material(parsed, shape):
+    """Plugin name of the shape's BSDF and the BTF material, if it is one."""
+    bsdfs = [child for _, child in parsed.children(shape) if parsing.is_kind(child, "BSDF")]
+    if not bsdfs:
+        return "diffuse", None
+    node, twosided = bsdfs[0], False
+    plugin = node.props.plugin_name()
+    if plugin == "twosided":
+        inner = [child for _, child in parsed.children(node)]
+        if len(inner) > 1:
+            raise InputError(
+                "unsupported: twosided with two materials", file=parsed.location(node), field="twosided"
+            )
+        if inner:
+            node, twosided, plugin = inner[0], True, inner[0].props.plugin_name()
+    if plugin != parsing.BTF:
+        return plugin, None
+    props = node.props
+    filter_type = props["filter_type"] if "filter_type" in props else None
+    if filter_type not in (None, "nearest", "bilinear"):
+        where = parsed.location(node)
+        raise InputError(
+            "unknown texel filter",
+            file=where,
+            field="filter_type",
+            got=filter_type,
+            expected="nearest or bilinear",
+        )
+    to_uv = np.eye(4) if "to_uv" not in props else np.array(props["to_uv"].matrix, float)
+    # Rows and columns of x, y and the translation, as Transform4f::extract() takes them.
+    affine = to_uv[:2][:, [0, 1, 3]]
+    scale = float(props["scale"]) if "scale" in props else 1.0
+    return plugin, BtfMaterial(props["filename"], filter_type, scale, affine, twosided)
+
+
+def _plain(parsed):
+    """Replace what the geometry does not need, so that no material, texture or integrator is loaded."""
+    import mitsuba as mi
+
+    for node in parsed.nodes:
+        kinds = {"BSDF": "diffuse", "Integrator": "direct"}
+        kind = next((k for k in kinds if parsing.is_kind(node, k)), None)
+        if kind:
+            for key in list(node.props.keys()):
+                del node.props[key]
+            node.props.set_plugin_name(kinds[kind])
+            node.type = getattr(mi.ObjectType, kind)
+
+
+def _camera(sensor):
+    import mitsuba as mi
+
+    values = mi.traverse(sensor)
+    width, height = (int(n) for n in sensor.film().size())
+    to_world = np.array(values["to_world"].matrix, float)
+    clip = float(values["near_clip"]), float(values["far_clip"])
+    return Camera(to_world, float(np.radians(float(values["x_fov"]))), width, height, *clip)
+
+
+def _light(kind, emitter):
+    """What the emitter sends, asked of Mitsuba itself: spectra and transforms are then its own."""
+    import mitsuba as mi
+
+    point = mi.SurfaceInteraction3f()
+    point.p = [0.0, 0.0, 0.0]
+    sample, weight = emitter.sample_direction(point, [0.5, 0.5], True)
+    if kind == "directional":
+        return Light(kind, np.array(sample.d, float), np.array(weight, float))
+    position = np.array(sample.p, float)
+    point.p = (position + [1.0, 0.0, 0.0]).tolist()
+    sample, weight = emitter.sample_direction(point, [0.5, 0.5], True)
+    return Light(kind, position, np.array(weight, float) * float(sample.dist) ** 2)

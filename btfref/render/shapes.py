@@ -1,0 +1,247 @@
+"""Shapes as triangles in world space, with Mitsuba's parametrization and frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from btfref.errors import InputError
+
+#: Segments of a full turn of a tessellated sphere, disk or cylinder: chords lie within 4e-5 radii of the surface.
+SEGMENTS = 384
+
+
+@dataclass(frozen=True)
+class BtfMaterial:
+    """What a ``btf`` BSDF says.
+
+    Parameters
+    ----------
+    filename : str
+        Absolute path of the representation.
+    filter_type : str or None
+        "nearest" or "bilinear"; None leaves it to the file.
+    scale : float
+        Factor on B.
+    to_uv : ndarray, shape (2, 3)
+        Texture coordinates of the lookup are ``to_uv @ (u, v, 1)``.
+    twosided : bool
+        Inside a ``twosided`` BSDF.
+    """
+
+    filename: str
+    filter_type: str | None
+    scale: float
+    to_uv: np.ndarray
+    twosided: bool
+
+
+@dataclass(frozen=True)
+class MeshDescription:
+    """Triangles of one shape, in world space.
+
+    Parameters
+    ----------
+    name : str
+        Identifier in the scene.
+    plugin : str
+        Mitsuba plugin of the shape.
+    positions : ndarray of float, shape (n, 3)
+    normals : ndarray of float, shape (n, 3), or None
+        Unit shading normals; None means geometric ones.
+    uv : ndarray of float, shape (n, 2)
+    faces : ndarray of int, shape (m, 3)
+        Counter-clockwise around the geometric normal.
+    flip : bool
+        Both normals point to the other side.
+    material : BtfMaterial or None
+        None for any other BSDF.
+    bsdf : str
+        Plugin of the BSDF, for messages.
+    to_world : ndarray, shape (4, 4)
+        The shape's own transform, as written in the scene (the positions have it already).
+    """
+
+    name: str
+    plugin: str
+    positions: np.ndarray
+    normals: np.ndarray | None
+    uv: np.ndarray
+    faces: np.ndarray
+    flip: bool
+    material: BtfMaterial | None
+    bsdf: str
+    to_world: np.ndarray
+
+    def corners(self):
+        """Per-triangle data for shading as Mitsuba 3.9 does it.
+
+        Returns
+        -------
+        positions, normals : ndarray of float64, shape (m, 3, 3)
+            Triangle, corner, xyz.
+        uv : ndarray of float64, shape (m, 3, 2)
+        dp_du : ndarray of float64, shape (m, 3)
+            Constant on each triangle. Where u and v do not span the triangle, the x axis of
+            :func:`coordinate_system` around the geometric normal.
+        """
+        p = self.positions.astype(float)[self.faces]
+        uv = self.uv.astype(float)[self.faces]
+        dp0, dp1 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
+        d0, d1 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+        geometric = _unit(np.cross(dp0, dp1))
+        determinant = d0[:, 0] * d1[:, 1] - d0[:, 1] * d1[:, 0]
+        spans = determinant != 0
+        safe = np.where(spans, determinant, 1.0)
+        dp_du = (d1[:, 1:] * dp0 - d0[:, 1:] * dp1) / safe[:, None]
+        dp_du = np.where(spans[:, None], dp_du, coordinate_system(geometric))
+        if self.normals is None:
+            normals = np.repeat(geometric[:, None], 3, axis=1)
+        else:
+            normals = self.normals.astype(float)[self.faces]
+        return p, -normals if self.flip else normals, uv, dp_du
+
+
+def coordinate_system(n):
+    """First tangent of Mitsuba's frame around unit vectors (Duff et al. 2017, listing 3), (..., 3) -> (..., 3)."""
+    x, y, z = np.moveaxis(n, -1, 0)
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    return np.stack([1 + sign * x * x * a, sign * x * y * a, -sign * x], -1)
+
+
+def _unit(v):
+    length = np.linalg.norm(v, axis=-1, keepdims=True)
+    return v / np.where(length > 0, length, 1.0)
+
+
+def triangles_of(shape, node, *, file):
+    """Vertices of a shape, read from the instantiated mesh or tessellated.
+
+    Parameters
+    ----------
+    shape : mitsuba.Shape
+        Of a scalar variant.
+    node : mitsuba.parser.SceneNode
+    file : str
+        Scene and line, for messages.
+
+    Returns
+    -------
+    dict
+        ``positions``, ``normals``, ``uv``, ``faces``, ``flip``, ``to_world`` of :class:`MeshDescription`.
+
+    Raises
+    ------
+    InputError
+        For a shape without texture coordinates or of a kind that has no triangles here.
+    """
+    import mitsuba as mi
+
+    props = node.props
+    plugin, name = props.plugin_name(), shape.id()
+    to_world = np.array(props["to_world"].matrix, float) if "to_world" in props else np.eye(4)
+    common = {"to_world": to_world}
+    if shape.is_mesh() and plugin not in _TESSELLATIONS:
+        if not shape.has_vertex_texcoords():
+            raise InputError("the shape has no texture coordinates", file=file, field=name, got=plugin)
+        arrays = mi.traverse(shape)
+        normals = None
+        if shape.has_vertex_normals() and not shape.has_face_normals():
+            normals = np.array(arrays["vertex_normals"]).reshape(-1, 3)
+        return common | {
+            "positions": np.array(arrays["vertex_positions"]).reshape(-1, 3),
+            "normals": normals,
+            "uv": np.array(arrays["vertex_texcoords"]).reshape(-1, 2),
+            "faces": np.array(arrays["faces"]).reshape(-1, 3).astype(np.int64),
+            "flip": bool(shape.has_flipped_normals()),
+        }
+    if plugin not in _TESSELLATIONS:
+        known = ", ".join(["meshes", *_TESSELLATIONS])
+        raise InputError(
+            "real-time rendering has no such shape", file=file, field=name, got=plugin, expected=known
+        )
+    positions, normals, uv, faces, local = _TESSELLATIONS[plugin](props)
+    matrix = to_world @ local
+    # Normals go with the inverse transpose.
+    normals = _unit(normals @ np.linalg.inv(matrix[:3, :3]))
+    if np.linalg.det(matrix[:3, :3]) < 0:
+        faces = faces[:, ::-1]
+    return common | {
+        "positions": positions @ matrix[:3, :3].T + matrix[:3, 3],
+        "normals": normals,
+        "uv": uv,
+        "faces": faces,
+        "flip": "flip_normals" in props and bool(props["flip_normals"]),
+    }
+
+
+def _grid(n_u, n_v):
+    """Corner parameters in [0, 1]² of a grid, shape ((n_v + 1)(n_u + 1), 2), and its triangles."""
+    u, v = np.meshgrid(np.linspace(0, 1, n_u + 1), np.linspace(0, 1, n_v + 1))
+    index = np.arange(u.size).reshape(u.shape)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    return np.stack([u.ravel(), v.ravel()], -1), faces
+
+
+def _without_slivers(faces, positions):
+    """Drop the triangles of no area, such as those at a pole."""
+    p = positions[faces]
+    area = np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1)
+    return faces[area > 1e-12 * area.max()]
+
+
+def _rectangle(props):
+    # u = (x + 1)/2, v = (y + 1)/2: rectangle.cpp of Mitsuba 3.9 (whose texture coordinate buffer says otherwise).
+    uv, faces = _grid(1, 1)
+    p = np.concatenate([2 * uv - 1, np.zeros((4, 1))], -1)
+    return p, np.tile([0.0, 0.0, 1.0], (4, 1)), uv, faces, np.eye(4)
+
+
+def _sphere(props):
+    # u = azimuth / 2π, v = polar angle / π: sphere.cpp of Mitsuba 3.9.
+    uv, faces = _grid(SEGMENTS, SEGMENTS // 2)
+    phi, theta = 2 * np.pi * uv[:, 0], np.pi * uv[:, 1]
+    p = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
+    # A pole has every azimuth: its corner takes the middle of its triangle's.
+    at_pole = (uv[:, 1] == 0) | (uv[:, 1] == 1)
+    uv[:, 0] += np.where(uv[:, 1] == 0, -0.5 / SEGMENTS, np.where(at_pole, 0.5 / SEGMENTS, 0.0))
+    local = np.eye(4)
+    radius = float(props["radius"]) if "radius" in props else 1.0
+    local[:3, :3] *= radius
+    if "center" in props:
+        local[:3, 3] = np.array(props["center"], float)
+    # theta grows downwards, so the grid's order is clockwise from outside.
+    return p, p.copy(), uv, _without_slivers(faces[:, ::-1], p), local
+
+
+def _disk(props):
+    # u = radius, v = azimuth / 2π: disk.cpp of Mitsuba 3.9.
+    uv, faces = _grid(1, SEGMENTS)
+    phi = 2 * np.pi * uv[:, 1]
+    p = np.stack([uv[:, 0] * np.cos(phi), uv[:, 0] * np.sin(phi), np.zeros(len(uv))], -1)
+    return p, np.tile([0.0, 0.0, 1.0], (len(p), 1)), uv, _without_slivers(faces, p), np.eye(4)
+
+
+def _cylinder(props):
+    # u = azimuth / 2π, v along the axis: cylinder.cpp of Mitsuba 3.9.
+    from mitsuba import ScalarTransform4f as Transform
+    from mitsuba import coordinate_system as mitsuba_coordinate_system
+
+    uv, faces = _grid(SEGMENTS, 1)
+    phi = 2 * np.pi * uv[:, 0]
+    normals = np.stack([np.cos(phi), np.sin(phi), np.zeros(len(uv))], -1)
+    p0 = np.array(props["p0"], float) if "p0" in props else np.zeros(3)
+    p1 = np.array(props["p1"], float) if "p1" in props else np.array([0.0, 0.0, 1.0])
+    radius = float(props["radius"]) if "radius" in props else 1.0
+    axis = p1 - p0
+    length = np.linalg.norm(axis)
+    s, t = (np.array(v, float) for v in mitsuba_coordinate_system((axis / length).tolist()))
+    local = np.array(Transform().translate(p0.tolist()).matrix, float)
+    local[:3, :3] = np.stack([radius * s, radius * t, axis], -1)
+    return np.concatenate([normals[:, :2], uv[:, 1:]], -1), normals, uv, faces, local
+
+
+_TESSELLATIONS = {"rectangle": _rectangle, "sphere": _sphere, "disk": _disk, "cylinder": _cylinder}
