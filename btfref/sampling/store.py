@@ -339,9 +339,10 @@ class BTFStore:
             },
             "dtype": str(self.dtype),
             "payload_bytes": count * self.dtype.itemsize,
-            "raw_bytes": count * self.dtype.itemsize,
+            # As for representations: a ratio is against 32-bit floats.
+            "raw_bytes": 4 * count,
             "file_bytes": sum(entry.stat().st_size for entry in files),
-            "ratio": 1.0,
+            "ratio": 4 / self.dtype.itemsize,
             "coverage": float(self.coverage.mean()),
             "complete": self.complete,
             "has_variance": self.has_variance,
