@@ -84,7 +84,7 @@ def attributes_of(path):
     try:
         attributes = json.loads(header.read_text(encoding="utf-8"))["attributes"]
         kind = attributes.get("kind")
-    except (ValueError, KeyError, AttributeError, UnicodeDecodeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             "header cannot be read", file=path, field="zarr.json", got=error, expected="JSON"
         ) from None
