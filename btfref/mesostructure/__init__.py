@@ -88,4 +88,13 @@ def build(mesostructure, **parameters):
                 field=key,
                 expected=f"one of {', '.join(known)}",
             )
-    return builder(**parameters)
+    try:
+        return builder(**parameters)
+    except InputError:
+        raise
+    except (TypeError, ValueError) as error:  # text where a number belongs, a list where a scalar does
+        raise InputError(
+            f"mesostructure '{mesostructure}' cannot take these values",
+            field=", ".join(parameters),
+            got=", ".join(map(repr, parameters.values())),
+        ) from error

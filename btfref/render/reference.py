@@ -108,9 +108,11 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
             for node in parsed.nodes:
                 if parsing.is_kind(node, "Film"):
                     _plain_film(parsed, node)
+            btf_shapes = _btf_shapes(parsed)
             made = parsed.instantiate()
             if not isinstance(made, mi.Scene):
                 raise InputError("the file does not describe a scene", file=parsed.source)
+            _demand_texture_coordinates(made, btf_shapes)
             if not made.sensors():
                 raise InputError("the scene has no sensor", file=parsed.source, field="sensor")
             return made
@@ -121,6 +123,25 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
     def __exit__(self, *_):
         if self._before is not None:
             parsing.use_variant(self._before)
+
+
+def _btf_shapes(parsed):
+    """Identifier → place of every shape with a BTF; to be asked before instantiation consumes the tree."""
+
+    def shows_btf(node):
+        materials = [child for _, child in parsed.children(node) if parsing.is_kind(child, "BSDF")]
+        return any(node.props.plugin_name() == parsing.BTF or shows_btf(node) for node in materials)
+
+    shapes = [node for node in parsed.nodes if parsing.is_kind(node, "Shape") and shows_btf(node)]
+    return {node.props.id(): parsed.location(node) for node in shapes}
+
+
+def _demand_texture_coordinates(made, btf_shapes):
+    """Refuse meshes with a BTF but no uv: Mitsuba would use the triangles' barycentric coordinates."""
+    for shape in made.shapes():
+        if shape.id() in btf_shapes and shape.is_mesh() and not shape.has_vertex_texcoords():
+            place = btf_shapes[shape.id()]
+            raise InputError("the shape has no texture coordinates", file=place, field=shape.id())
 
 
 def _plain_film(parsed, film):
