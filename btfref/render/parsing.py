@@ -74,8 +74,13 @@ class ParsedScene:
 
 
 def one_line(error):
-    """Mitsuba's message without its C++ source positions."""
-    return " ".join(re.sub(r"\[[\w./]+\.(?:cpp|h):\d+\]\s*", "", str(error)).split())
+    """Mitsuba's message without its C++ source positions and without the traceback of a plugin in Python."""
+    text = re.sub(r"\[[\w./]+\.(?:cpp|h):\d+\]\s*", "", str(error))
+    # The last line of a traceback is the exception, after its class name.
+    text = re.sub(
+        r"Traceback \(most recent call last\):.*\n\S*?(?:Error|Exception): ", "", text, flags=re.DOTALL
+    )
+    return " ".join(text.split())
 
 
 def use_variant(name):
