@@ -9,6 +9,7 @@ would hide the file from later includes) is an error, never a silent omission.
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path, PurePosixPath
 
@@ -192,8 +193,9 @@ def _literal(name, value):
 def representation_defines(rep):
     """Constants that a representation's GLSL file may use.
 
-    For each array NAME of shape (a, b, …): ``NAME_DIM0 a``, ``NAME_DIM1 b``, … before padding, and
-    ``NAME_STRIDE``, the RGBA texels of one item of the port array's last axis; and every entry of ``rep.meta["constants"]``.
+    For each port array NAME of shape (a, b, …, k): ``NAME_DIM0 a``, ``NAME_DIM1 b``, …, the last one counted before
+    the padding to a multiple of 4; ``NAME_STRIDE``, the RGBA texels of one item of the last axis; and every entry
+    of ``rep.meta["constants"]``.
 
     Parameters
     ----------
@@ -204,9 +206,11 @@ def representation_defines(rep):
     dict
     """
     defines = {}
-    for name, array in rep.arrays().items():
-        defines |= {f"{name}_DIM{axis}".upper(): int(size) for axis, size in enumerate(array.shape)}
+    maps = rep.arrays()
     for name, array in rep.port_arrays().items():
+        leading = array.shape[:-1]
+        dimensions = [*leading, maps[name].size // math.prod(leading)]
+        defines |= {f"{name}_DIM{axis}".upper(): int(size) for axis, size in enumerate(dimensions)}
         defines[f"{name}_STRIDE".upper()] = int(array.shape[-1]) // 4
     constants = rep.meta.get("constants", {})
     defines.update({key.upper(): value for key, value in constants.items()})

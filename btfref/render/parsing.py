@@ -146,9 +146,8 @@ def parse(scene, parameters=None, *, variant, size=None):
         raise InputError(one_line(error), file=source) from error
     parsed = ParsedScene(state, config, source)
     for node in parsed.nodes:
-        if node.props.plugin_name() == BTF:
-            _resolve_file(parsed, node, None if is_dict else Path(scene).resolve().parent)
-        elif _is(node, "Film") and size is not None:
+        _resolve_file(parsed, node, None if is_dict else Path(scene).resolve().parent)
+        if _is(node, "Film") and size is not None:
             node.props["width"], node.props["height"] = int(size[0]), int(size[1])
     return parsed
 
@@ -164,11 +163,20 @@ def is_kind(node, kind):
 
 
 def _resolve_file(parsed, node, beside):
+    """Make the node's relative file name absolute.
+
+    Mitsuba looks beside the scene file only when it loads the file itself. BTF files come from the command line, so
+    that the current directory goes first for them.
+    """
+    is_btf = node.props.plugin_name() == BTF
     name = node.props["filename"] if "filename" in node.props else None
     if not isinstance(name, str) or not name:
-        raise InputError("a btf material without a file", file=parsed.location(node), field="filename")
-    for directory in (Path.cwd(), beside):
+        if is_btf:
+            raise InputError("a btf material without a file", file=parsed.location(node), field="filename")
+        return
+    for directory in (Path.cwd(), beside) if is_btf else (beside, Path.cwd()):
         if directory is not None and (directory / name).is_file():
             node.props["filename"] = str((directory / name).resolve())
             return
-    raise InputError("no such BTF file", file=parsed.location(node), field="filename", got=name)
+    if is_btf:
+        raise InputError("no such BTF file", file=parsed.location(node), field="filename", got=name)

@@ -15,6 +15,7 @@ from btfref.errors import InputError
 from btfref.render import gl
 from btfref.render.result import RenderResult
 from btfref.render.scene import SceneDescription, read_scene
+from btfref.render.shapes import neighbours
 
 
 def realtime(scene, *, parameters=None, grid=4, size=None):
@@ -173,6 +174,7 @@ class Renderer:
                 gl.bind(program, {**shown.textures, "triangles": table})
                 row0, row1 = mesh.material.to_uv
                 own = {"uv_row0": row0, "uv_row1": row1, "scale": mesh.material.scale}
+                own["uv_rotation"] = mesh.material.rotation
                 gl.set_uniforms(program, {**common, **own, "two_sided": mesh.material.twosided})
                 vertices.render(ctx.TRIANGLES, vertices=3 * len(mesh.faces))
         ctx.finish()
@@ -198,15 +200,18 @@ def triangle_table(mesh):
 
     Returns
     -------
-    ndarray of float32, shape (m, 7, 4)
-        Three positions with u, three normals with v, dp/du.
+    ndarray of float32, shape (m, 8, 4)
+        Three positions with u, three normals with v, dp/du, neighbours.
     """
     positions, normals, uv, dp_du = mesh.corners()
-    table = np.zeros((len(positions), 7, 4), np.float32)
+    if len(positions) > 1 << 24:
+        raise InputError("too many triangles for float32 indices", field=mesh.name, got=len(positions))
+    table = np.zeros((len(positions), 8, 4), np.float32)
     table[:, 0:3, :3], table[:, 0:3, 3] = positions, uv[..., 0]
     table[:, 3:6, :3], table[:, 3:6, 3] = normals, uv[..., 1]
     # Only the direction counts; unit length keeps float32 far from overflow.
     table[:, 6, :3] = dp_du / np.linalg.norm(dp_du, axis=-1, keepdims=True)
+    table[:, 7, :3] = neighbours(mesh.positions, mesh.faces)
     return table
 
 

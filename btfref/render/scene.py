@@ -229,6 +229,9 @@ def _material(parsed, shape):
     to_uv = np.eye(4) if "to_uv" not in props else np.array(props["to_uv"].matrix, float)
     # Rows and columns of x, y and the translation, as Transform4f::extract() takes them.
     affine = to_uv[:2][:, [0, 1, 3]]
+    if np.linalg.det(affine[:, :2]) <= 0:
+        where = parsed.location(node)
+        raise InputError("the transform mirrors or is singular", file=where, field="to_uv", expected="a determinant > 0")
     scale = float(props["scale"]) if "scale" in props else 1.0
     return plugin, BtfMaterial(props["filename"], filter_type, scale, affine, twosided)
 

@@ -25,7 +25,7 @@ class BtfMaterial:
     scale : float
         Factor on B.
     to_uv : ndarray, shape (2, 3)
-        Texture coordinates of the lookup are ``to_uv @ (u, v, 1)``.
+        Texture coordinates of the lookup are ``to_uv @ (u, v, 1)``; the linear part has a positive determinant.
     twosided : bool
         Inside a ``twosided`` BSDF.
     """
@@ -35,6 +35,16 @@ class BtfMaterial:
     scale: float
     to_uv: np.ndarray
     twosided: bool
+
+    @property
+    def rotation(self):
+        """Cosine and sine of the angle that local directions turn about the normal to reach the texture's frame.
+
+        The rotation nearest to the linear part of ``to_uv``, as in the plugin ``btf``.
+        """
+        c, s = self.to_uv[0, 0] + self.to_uv[1, 1], self.to_uv[1, 0] - self.to_uv[0, 1]
+        length = np.hypot(c, s)
+        return (float(c / length), float(s / length)) if length > 0 else (1.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -101,6 +111,31 @@ class MeshDescription:
         else:
             normals = self.normals.astype(float)[self.faces]
         return p, -normals if self.flip else normals, uv, dp_du
+
+
+def neighbours(positions, faces):
+    """Triangle across each edge, by position, so that seams of the texture do not separate.
+
+    Parameters
+    ----------
+    positions : ndarray, shape (n, 3)
+    faces : ndarray of int, shape (m, 3)
+
+    Returns
+    -------
+    ndarray of int64, shape (m, 3)
+        Column k: across the edge opposite corner k; -1 at borders and where more than two triangles meet.
+    """
+    corner = np.unique(positions, axis=0, return_inverse=True)[1].reshape(-1)[faces]
+    edges = np.sort(np.concatenate([corner[:, [1, 2]], corner[:, [2, 0]], corner[:, [0, 1]]]), axis=1)
+    owner = np.tile(np.arange(len(faces)), 3)
+    _, edge, count = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
+    edge = edge.reshape(-1)
+    order = np.argsort(edge, kind="stable")
+    pairs = order[count[edge[order]] == 2].reshape(-1, 2)
+    result = np.full(len(edges), -1, np.int64)
+    result[pairs[:, 0]], result[pairs[:, 1]] = owner[pairs[:, 1]], owner[pairs[:, 0]]
+    return result.reshape(3, len(faces)).T
 
 
 def coordinate_system(n):

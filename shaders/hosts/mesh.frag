@@ -15,6 +15,7 @@ uniform vec2 film_offset;   // from gl_FragCoord.x and height - gl_FragCoord.y t
 uniform float film_height;
 uniform vec3 uv_row0;       // texture transform: u' = dot(uv_row0, (u, v, 1))
 uniform vec3 uv_row1;
+uniform vec2 uv_rotation;   // cosine and sine of the turn that the texture transform gives to the local frame
 uniform float scale;
 uniform bool two_sided;
 
@@ -25,8 +26,8 @@ out vec4 radiance;
 void main() {
     vec2 film = vec2(gl_FragCoord.x, film_height - gl_FragCoord.y) + film_offset;
     vec3 direction = normalize(ray_corner + film.x * ray_right + film.y * ray_down);
-    SurfacePoint point = triangle_intersect(triangles, triangle, camera_origin, direction);
-    mat3 to_local = shading_frame(point.normal, point.dp_du);
+    SurfacePoint point = scene_intersect(triangles, triangle, camera_origin, direction);
+    mat3 to_local = frame_turned(shading_frame(point.normal, point.dp_du), uv_rotation);
     vec3 uv1 = vec3(point.uv, 1.0);
     vec2 uv = vec2(dot(uv_row0, uv1), dot(uv_row1, uv1));
     vec3 w_view = to_local * -direction;

@@ -1,9 +1,9 @@
-// Provides SceneTriangle and triangle_intersect: a mesh triangle from its table, and the exact point that a ray meets.
-// Expects triangles of seven texels written by btfref.render.realtime: positions with u, normals with v, dp/du.
+// Provides scene_intersect: the exact point where a ray meets a mesh, given a triangle that it meets or just misses.
+// Expects triangles of eight texels written by btfref.render.realtime: positions, normals, uv, dp/du, neighbours.
 
 #include "lib/table.glsl"
 
-const int SCENE_TRIANGLE_TEXELS = 7;
+const int SCENE_TRIANGLE_TEXELS = 8;
 
 struct SurfacePoint {
     vec3 position;
@@ -12,25 +12,54 @@ struct SurfacePoint {
     vec2 uv;
 };
 
-// Ray and triangle by Moeller and Trumbore 1997. The rasterizer snaps vertices to 1/256 pixel and interpolates what
-// it snapped; the ray gives the same barycentric coordinates as a ray tracer, to float accuracy. The ray is taken to
-// meet the triangle's plane: the rasterizer has decided that the pixel belongs to it.
-SurfacePoint triangle_intersect(sampler2DArray triangles, int i, vec3 origin, vec3 direction) {
-    int at = i * SCENE_TRIANGLE_TEXELS;
-    vec4 a = table_fetch(triangles, at), b = table_fetch(triangles, at + 1), c = table_fetch(triangles, at + 2);
-    vec4 n_a = table_fetch(triangles, at + 3), n_b = table_fetch(triangles, at + 4);
-    vec4 n_c = table_fetch(triangles, at + 5), tangent = table_fetch(triangles, at + 6);
-    vec3 edge1 = b.xyz - a.xyz, edge2 = c.xyz - a.xyz;
+// Barycentric coordinates of the point where a ray meets a triangle's plane (Moeller and Trumbore 1997, eq. 6).
+vec3 scene_barycentric(sampler2DArray triangles, int triangle, vec3 origin, vec3 direction) {
+    int at = triangle * SCENE_TRIANGLE_TEXELS;
+    vec3 a = table_fetch(triangles, at).xyz;
+    vec3 edge1 = table_fetch(triangles, at + 1).xyz - a, edge2 = table_fetch(triangles, at + 2).xyz - a;
     vec3 p = cross(direction, edge2);
     float inverse = 1.0 / dot(edge1, p);
-    vec3 from_a = origin - a.xyz;
+    vec3 from_a = origin - a;
     float beta = dot(from_a, p) * inverse;
     float gamma = dot(direction, cross(from_a, edge1)) * inverse;
+    return vec3(1.0 - beta - gamma, beta, gamma);
+}
+
+// The rasterizer snaps vertices to 1/256 pixel and interpolates what it snapped. The ray gives the coordinates that a
+// ray tracer has; where they lie outside, the ray belongs to the neighbour, whose dp/du differs.
+SurfacePoint scene_intersect(sampler2DArray triangles, int rasterized, vec3 origin, vec3 direction) {
+    int triangle = rasterized;
+    vec3 own = scene_barycentric(triangles, triangle, origin, direction);
+    vec3 at_point = own;
+    // Four steps go around any vertex that is not a pole; a ray that finds no triangle passes the silhouette, and
+    // the rasterizer's triangle is continued.
+    for (int i = 0; i < 4; ++i) {
+        float least = min(at_point.x, min(at_point.y, at_point.z));
+        if (least >= 0.0) {
+            break;
+        }
+        vec3 across = table_fetch(triangles, triangle * SCENE_TRIANGLE_TEXELS + 7).xyz;
+        float next = least == at_point.x ? across.x : least == at_point.y ? across.y : across.z;
+        if (next < 0.0) {
+            break;
+        }
+        triangle = int(next);
+        at_point = scene_barycentric(triangles, triangle, origin, direction);
+    }
+    if (min(at_point.x, min(at_point.y, at_point.z)) < 0.0) {
+        triangle = rasterized;
+        at_point = own;
+    }
+    int at = triangle * SCENE_TRIANGLE_TEXELS;
+    vec4 a = table_fetch(triangles, at), b = table_fetch(triangles, at + 1), c = table_fetch(triangles, at + 2);
+    vec4 n_a = table_fetch(triangles, at + 3), n_b = table_fetch(triangles, at + 4);
+    vec4 n_c = table_fetch(triangles, at + 5);
     SurfacePoint s;
-    s.position = a.xyz + beta * edge1 + gamma * edge2;
-    s.normal = normalize(n_a.xyz * (1.0 - beta - gamma) + n_b.xyz * beta + n_c.xyz * gamma);
+    // Differences to corner a: texture coordinates far from zero lose nothing.
+    s.position = a.xyz + at_point.y * (b.xyz - a.xyz) + at_point.z * (c.xyz - a.xyz);
+    s.normal = normalize(n_a.xyz * at_point.x + n_b.xyz * at_point.y + n_c.xyz * at_point.z);
     vec2 uv_a = vec2(a.w, n_a.w);
-    s.uv = uv_a + beta * (vec2(b.w, n_b.w) - uv_a) + gamma * (vec2(c.w, n_c.w) - uv_a);
-    s.dp_du = tangent.xyz;
+    s.uv = uv_a + at_point.y * (vec2(b.w, n_b.w) - uv_a) + at_point.z * (vec2(c.w, n_c.w) - uv_a);
+    s.dp_du = table_fetch(triangles, at + 6).xyz;
     return s;
 }

@@ -2,7 +2,7 @@
 // Expects basis [cluster, view, light, packet], weights [row, column, component], cluster [row, column, 1].
 
 // Mueller, Meseth, Klein 2004: B_x = mean_k(x) + sum over i of weight_i E_(i,k(x)); entry 0 of a packet is the mean.
-#define PACKET_COLOURS BASIS_DIM3
+#define PACKET_COLOURS (1 + WEIGHTS_DIM2)
 
 #include "lib/directions.glsl"
 #include "lib/packets.glsl"
