@@ -67,8 +67,8 @@ def uv_transform(matrix):
     affine = np.concatenate([m[:2, :2], m[:2, -1:]], 1)
     if np.linalg.det(affine[:, :2]) <= 0:
         raise InputError("the transform mirrors or is singular", field="to_uv", expected="a positive determinant")
-    c, s = affine[0, 0] + affine[1, 1], affine[1, 0] - affine[0, 1]
-    length = np.hypot(c, s)
+    c, s = float(affine[0, 0] + affine[1, 1]), float(affine[1, 0] - affine[0, 1])
+    length = float(np.hypot(c, s))
     return affine, ((c / length, s / length) if length > 0 else (1.0, 0.0))
 
 
@@ -85,6 +85,7 @@ def make_bsdf():
         filter_type string   "bilinear" or "nearest"; default: what the file says
         scale      float     factor of the reflectance, ≥ 0; default 1
         to_uv      transform of the texture coordinates; its rotation also turns the local frame
+        sampling   string    "data" (default): light directions by the data; "cosine": by the cosine, for comparison
         ========== ========= ==================================================================================
 
         Values hold the light's cosine already. The surface reflects on its front side only; wrap it in
@@ -100,21 +101,19 @@ def make_bsdf():
                 raise InputError("the plugin 'btf' needs a file", field="filename")
             representation = load(str(mi.file_resolver().resolve(str(self.filename))))
             own = representation.meta["filter_type"]
-            self.filter_type = _parameter(props, "filter_type", own)
-            if self.filter_type not in FILTER_TYPES:
-                raise InputError(
-                    "unknown filter", field="filter_type", got=self.filter_type, expected=" or ".join(FILTER_TYPES)
-                )
+            self.filter_type = _choice(props, "filter_type", own, FILTER_TYPES)
+            sampling = _choice(props, "sampling", "data", ("data", "cosine"))
             scale = float(_parameter(props, "scale", 1.0))
             if not (np.isfinite(scale) and scale >= 0):
                 raise InputError("the scale is out of range", field="scale", got=scale, expected="a finite value ≥ 0")
             self.scale = mi.Float(scale)
             affine, self.rotation = uv_transform(_matrix(_parameter(props, "to_uv", None)))
-            self.affine = affine
+            # Python floats: NumPy scalars would try to read a symbolic operand.
+            self.affine = affine.tolist()
             self.key = representation.meta["method"]
             self.maps = Maps(representation, self.filter_type)
             self.evaluator = import_module(method(self.key).plugin).Evaluator(self.maps)
-            self.guide = LightGuide(representation, self.maps.views)
+            self.guide = LightGuide(representation, self.maps.views, sampling)
             flags = (
                 mi.BSDFFlags.GlossyReflection
                 | mi.BSDFFlags.FrontSide
@@ -127,10 +126,7 @@ def make_bsdf():
 
         def _local(self, ctx, si, wo):
             """Texture coordinates and directions in the texture's frame."""
-            a = self.affine
-            uv = mi.Point2f(
-                a[0, 0] * si.uv.x + a[0, 1] * si.uv.y + a[0, 2], a[1, 0] * si.uv.x + a[1, 1] * si.uv.y + a[1, 2]
-            )
+            uv = mi.Point2f(*(dr.fma(si.uv.x, a, dr.fma(si.uv.y, b, c)) for a, b, c in self.affine))
             w_view, w_light = self._turn(si.wi), self._turn(wo)
             if ctx.mode == mi.TransportMode.Importance:
                 w_view, w_light = w_light, w_view
@@ -215,6 +211,13 @@ def make_bsdf():
 
 def _parameter(props, name, default):
     return props[name] if name in props else default  # noqa: SIM401  (Properties has no get with default)
+
+
+def _choice(props, name, default, choices):
+    value = _parameter(props, name, default)
+    if value not in choices:
+        raise InputError("unknown value of a parameter", field=name, got=repr(value), expected=" or ".join(choices))
+    return value
 
 
 def _matrix(transform):

@@ -20,7 +20,7 @@ N_CELLS = N_RADIAL * N_AZIMUTH
 
 #: Share of pure cosine sampling: bounds the weight of a sample by 1 / share times that of cosine sampling, for texels
 #: that differ from their group's mean.
-COSINE_SHARE = 0.25
+COSINE_SHARE = 0.3
 
 #: Points per side of a cell over which B / cos θ is averaged.
 _SUBSAMPLES = 4
@@ -70,12 +70,16 @@ class LightGuide:
     representation : Representation
     views : RingTable or TriangleTable
         Port of the interpolation over views.
+    sampling : {"data", "cosine"}
+        "cosine" ignores the data: the yardstick that the guide is measured against.
     """
 
-    def __init__(self, representation, views):
+    def __init__(self, representation, views, sampling):
         group, mean = representation.sampling_tables()
-        lights = interpolation.from_arrays(representation.arrays(), "light")
-        density = cell_densities(mean, lights)
+        if sampling == "cosine":
+            group, density = np.zeros_like(group), np.ones((1, mean.shape[1], N_CELLS), np.float32)
+        else:
+            density = cell_densities(mean, interpolation.from_arrays(representation.arrays(), "light"))
         rows = density.reshape(*density.shape[:2], N_RADIAL, N_AZIMUTH)
         marginal = np.cumsum(rows.sum(-1), -1)
         conditional = np.cumsum(rows, -1)
@@ -160,4 +164,4 @@ class LightGuide:
             step //= 2
         high = dr.gather(mi.Float, table, start + index, active)
         position = (sample - low) / dr.maximum(high - low, 1e-20)
-        return index, dr.clip(position, 0, 0x1.FFFFFEp-1)
+        return index, dr.clip(position, 0, dr.one_minus_epsilon(mi.Float))

@@ -13,19 +13,52 @@ LLOYD_ITERATIONS = 8
 def spread_seeds(points, n_clusters, rng):
     """Indices of initial centres by k-means++ (Arthur and Vassilvitskii 2007)."""
     chosen = [int(rng.integers(len(points)))]
-    distance = ((points - points[chosen[0]]) ** 2).sum(1)
+    squared = (points**2).sum(1)
+    distance = _distance(points, squared, chosen[0])
     for _ in range(n_clusters - 1):
         total = distance.sum()
         # All remaining points coincide with a centre: any choice is as good, the first keeps it deterministic.
-        following = int(rng.choice(len(points), p=distance / total)) if total > 0 else 0
+        following = int(np.searchsorted(np.cumsum(distance), rng.random() * total)) if total > 0 else 0
+        following = min(following, len(points) - 1)
         chosen.append(following)
-        distance = np.minimum(distance, ((points - points[following]) ** 2).sum(1))
+        distance = np.minimum(distance, _distance(points, squared, following))
     return np.array(chosen)
+
+
+def _distance(points, squared, i):
+    return np.maximum(squared - 2 * points @ points[i] + squared[i], 0)
 
 
 def assign_nearest(points, centres):
     """Index of the nearest centre of each point; ties go to the lowest index."""
     return np.argmin((centres**2).sum(1) - 2 * points @ centres.T, 1)
+
+
+def lloyd(points, n_clusters, rng, *, iterations=LLOYD_ITERATIONS):
+    """A few iterations of k-means from k-means++ seeds.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, d)
+    n_clusters : int
+        At most n.
+    rng : numpy.random.Generator
+    iterations : int
+
+    Returns
+    -------
+    labels : ndarray of int64, shape (n,)
+    centres : ndarray, shape (n_clusters, d)
+    """
+    centres = points[spread_seeds(points, n_clusters, rng)]
+    for _ in range(iterations):
+        labels = assign_nearest(points, centres)
+        member = np.zeros((n_clusters, len(points)), points.dtype)
+        member[labels, np.arange(len(points))] = 1
+        count = member.sum(1, keepdims=True)
+        # An abandoned centre stays where it is.
+        centres = np.where(count > 0, member @ points / np.maximum(count, 1), centres)
+    return assign_nearest(points, centres), centres
 
 
 def local_pca(points, n_clusters, n_components, rng):
@@ -49,15 +82,7 @@ def local_pca(points, n_clusters, n_components, rng):
     n, dimension = points.shape
     n_used = min(n_clusters, n)
     rank = min(n_components, dimension)
-    centres = points[spread_seeds(points, n_used, rng)]
-    for _ in range(LLOYD_ITERATIONS):
-        labels = assign_nearest(points, centres)
-        count = np.bincount(labels, minlength=n_used)
-        # An abandoned centre stays where it is.
-        sums = np.zeros_like(centres)
-        np.add.at(sums, labels, points)
-        centres = np.where(count[:, None] > 0, sums / np.maximum(count, 1)[:, None], centres)
-    labels = assign_nearest(points, centres)
+    labels, _ = lloyd(points, n_used, rng)
     best, best_error, previous = labels, np.inf, np.inf
     iteration = 0
     for iteration in range(1, MAXIMUM_ITERATIONS + 1):  # noqa: B007

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from btfref import conventions
+from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import base_meta, direction_arrays, evaluate_tabulated, packed_arrays
 
 PRESETS = {"paper": {}}
@@ -39,11 +40,12 @@ class Representation:
         return packed_arrays(self.maps)
 
     def sampling_tables(self):
-        """One group: the mean over all texels."""
+        """Groups of texels alike, and their means."""
         values = self.maps["values"]
-        # Texel rows are averaged one by one: the float64 copy stays small.
-        mean = np.mean([row.mean(0, dtype=np.float64) for row in values], 0)
-        return np.zeros(values.shape[:2], np.uint32), conventions.luminance(mean)[None]
+        table = values.reshape(-1, *values.shape[2:])
+        some = conventions.luminance(table[:, feature_views(table.shape[1])].astype(np.float32))
+        labels = texel_groups(some.reshape(len(table), -1))
+        return labels.reshape(values.shape[:2]), conventions.luminance(group_means(labels, table))
 
     @classmethod
     def from_arrays(cls, arrays, meta):

@@ -12,6 +12,7 @@ import numpy as np
 
 from btfref import conventions
 from btfref.numerics.lowrank import range_basis, texel_matrix
+from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
     base_meta,
     direction_arrays,
@@ -58,10 +59,13 @@ class Representation:
         return packed_arrays(self.maps, basis=basis.reshape(*basis.shape[:2], -1))
 
     def sampling_tables(self):
-        """One group: the mean over all texels."""
-        weights = self.maps["weights"].astype(float)
-        mean = np.tensordot(weights.mean((0, 1)), self.maps["basis"].astype(float), 1)
-        return np.zeros(weights.shape[:2], np.uint32), conventions.luminance(mean)[None]
+        """Groups of texels alike, and their means."""
+        weights = self.maps["weights"].astype(np.float32)
+        basis = conventions.luminance(self.maps["basis"].astype(np.float32))
+        flat = weights.reshape(-1, weights.shape[-1])
+        some = np.tensordot(flat, basis[:, feature_views(basis.shape[1])], 1)
+        labels = texel_groups(some.reshape(len(flat), -1))
+        return labels.reshape(weights.shape[:2]), np.tensordot(group_means(labels, flat), basis, 1)
 
     @classmethod
     def from_arrays(cls, arrays, meta):
