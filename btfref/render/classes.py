@@ -11,19 +11,20 @@ BACKGROUND, INTERIOR, SILHOUETTE = 0, 1, 2
 #: Names by value, for reports.
 CLASSES = ("background", "interior", "silhouette")
 
-#: A step between neighbouring samples that leaves the tangent plane by more than this share of a pixel's footprint
-#: is an edge. A smooth surface of curvature κ leaves it by κ s²/2 (s the distance of the samples), which is far
-#: less; a fold in front of another surface leaves it by their distance.
+#: A step between neighbouring samples that leaves the tangent plane by more than this share of a pixel's
+#: footprint is an edge. A smooth surface of curvature κ leaves it by κ s²/2 (s the distance of the samples),
+#: which is far less; a fold in front of another surface leaves it by their distance.
 STEP = 0.25
 
 
 def pixel_classes(scene, *, parameters=None, size=None, grid=4, variant="llvm_ad_rgb"):
     """Class of every pixel, from the primary hits of a regular sub-pixel grid.
 
-    A pixel is *silhouette* when samples of it or of its eight neighbours mix hit and miss or several shapes, when
-    the surface jumps in depth between two of them (a fold in front of the cloth itself), or when the view passes the
-    horizon of the shading normal, where B jumps to zero. There, two renderers may see different surfaces at the same
-    sample: rasterizers snap vertices to 1/256 pixel. All other pixels that are hit are *interior*.
+    A pixel is *silhouette* when samples of it or of its eight neighbours mix hit and miss or several shapes,
+    when the surface jumps in depth between two of them (a fold in front of the cloth itself), or when the
+    view passes the horizon of the shading normal, where B jumps to zero. There, two renderers may see
+    different surfaces at the same sample: rasterizers snap vertices to 1/256 pixel. All other pixels that are
+    hit are *interior*.
 
     Parameters
     ----------

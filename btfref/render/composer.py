@@ -193,9 +193,9 @@ def _literal(name, value):
 def representation_defines(rep):
     """Constants that a representation's GLSL file may use.
 
-    For each port array NAME of shape (a, b, …, k): ``NAME_DIM0 a``, ``NAME_DIM1 b``, …, the last one counted before
-    the padding to a multiple of 4; ``NAME_STRIDE``, the RGBA texels of one item of the last axis; and every entry
-    of ``rep.meta["constants"]``.
+    For each port array NAME of shape (a, b, …, k): ``NAME_DIM0 a``, ``NAME_DIM1 b``, …, the last one counted
+    before the padding to a multiple of 4; ``NAME_STRIDE``, the RGBA texels of one item of the last axis; and
+    every entry of ``rep.meta["constants"]``.
 
     Parameters
     ----------

@@ -48,7 +48,7 @@ class ParsedScene:
     def children(self, node):
         """Nodes that ``node`` refers to, in their order, as ``(index, node)``."""
         result = []
-        for key in node.props.keys():  # noqa: SIM118 - Properties iterates over keys only this way
+        for key in node.props.keys():
             value = node.props[key]
             if type(value).__name__ == "ResolvedReference":
                 result.append((value.index(), self.nodes[value.index()]))
@@ -116,8 +116,8 @@ def parse(scene, parameters=None, *, variant, size=None):
     Returns
     -------
     ParsedScene
-        File names of ``btf`` materials are absolute: relative ones are looked up in the current directory, then
-        beside the scene file. Equal nodes and meshes are kept apart.
+        File names of ``btf`` materials are absolute: relative ones are looked up in the current directory,
+        then beside the scene file. Equal nodes and meshes are kept apart.
 
     Raises
     ------
@@ -157,16 +157,18 @@ def _is(node, kind):
 
 
 def is_kind(node, kind):
-    """Whether a node is a "Shape", "BSDF", "Emitter", "Sensor", "Film", "Integrator"…"""
-    # In dictionaries, plugins that the current variant does not know come without a type.
+    """Whether a node is a "Shape", "BSDF", "Emitter", "Sensor", "Film", and so on.
+
+    In dictionaries, plugins that the current variant does not know come without a type.
+    """
     return _is(node, kind) or (kind == "BSDF" and node.props.plugin_name() == BTF)
 
 
 def _resolve_file(parsed, node, beside):
     """Make the node's relative file name absolute.
 
-    Mitsuba looks beside the scene file only when it loads the file itself. BTF files come from the command line, so
-    that the current directory goes first for them.
+    Mitsuba looks beside the scene file only when it loads the file itself. BTF files come from the command
+    line, so that the current directory goes first for them.
     """
     is_btf = node.props.plugin_name() == BTF
     name = node.props["filename"] if "filename" in node.props else None

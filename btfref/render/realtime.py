@@ -1,8 +1,8 @@
 """The real-time renderer: the same scene through GLSL, without a window.
 
-Direct light of directional and point lights without cast shadows. The sub-pixel grid is the one of the noise-free
-reference (:mod:`btfref.render.reference`): n × n regular samples a pixel, box filter. Each sample is one frame with
-a shifted projection; frames are added in float64.
+Direct light of directional and point lights without cast shadows. The sub-pixel grid is the one of the
+noise-free reference (:mod:`btfref.render.reference`): n × n regular samples a pixel, box filter. Each sample
+is one frame with a shifted projection; frames are added in float64.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ def realtime(scene, *, parameters=None, grid=4, size=None):
     -------
     RenderResult
         ``meta["frame_ms"]`` is the median time of one frame (one sample a pixel), GPU timer and wall clock
-        whichever is longer; ``gl_vendor``, ``gl_renderer``, ``gl_version``; ``negative_fraction``, the share of
-        channels below zero, and ``not_finite``, their number: nothing is clamped.
+        whichever is longer; ``gl_vendor``, ``gl_renderer``, ``gl_version``; ``negative_fraction``, the share
+        of channels below zero, and ``not_finite``, their number: nothing is clamped.
 
     Raises
     ------
     InputError
-        For a scene that cannot be read (see :func:`btfref.render.scene.read_scene`), without lights, or with a
-        shape that has no BTF.
+        For a scene that cannot be read (see :func:`btfref.render.scene.read_scene`), without lights, or with
+        a shape that has no BTF.
     MissingDependencyError
         Without an OpenGL driver.
     """

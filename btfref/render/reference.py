@@ -1,7 +1,7 @@
 """The reference renderer: Mitsuba with any integrator, and noise-free direct light of delta lights.
 
-The film is always float32 with a box filter, so that a pixel is the plain mean of its samples: Mitsuba's default
-Gaussian filter mixes pixels and its float16 files round.
+The film is always float32 with a box filter, so that a pixel is the plain mean of its samples: Mitsuba's
+default Gaussian filter mixes pixels and its float16 files round.
 """
 
 from __future__ import annotations
@@ -45,8 +45,9 @@ def render(
     seed : int
         The same seed gives the same image on the same machine.
     noise_free : int, optional
-        Direct light only, n × n regular sub-pixel samples at (i + ½)/n, the material evaluated towards each light:
-        nothing is random. Needs delta lights and a JIT variant; replaces integrator, sampler, spp and seed.
+        Direct light only, n × n regular sub-pixel samples at (i + ½)/n, the material evaluated towards each
+        light: nothing is random. Needs delta lights and a JIT variant; replaces integrator, sampler, spp and
+        seed.
     shadows : bool
         False leaves cast shadows out (``noise_free`` only).
     size : (int, int), optional
@@ -83,7 +84,7 @@ def render(
 
 
 class loaded:  # noqa: N801 - a context manager that reads as a verb
-    """``with loaded(scene, parameters, variant=…, size=…) as mitsuba_scene``; restores the variant afterwards."""
+    """``with loaded(scene, parameters, variant=…, size=…) as mitsuba_scene``; restores the variant."""
 
     def __init__(self, scene, parameters=None, *, variant="llvm_ad_rgb", size=None):
         self._arguments = scene, parameters, variant, size

@@ -1,4 +1,4 @@
-"""Mitsuba scenes as plain data: camera, meshes, BTF materials, lights. The real-time renderer needs no more."""
+"""Mitsuba scenes as plain data: camera, meshes, BTF materials, lights; all that real-time rendering needs."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Camera:
         return x, x * self.height / self.width
 
     def ray_basis(self):
-        """Directions of film points: ``corner + x · right + y · down`` for pixel coordinates from the top left.
+        """Directions of film points: ``corner + x · right + y · down``, in pixels from the top left.
 
         Returns
         -------
@@ -126,8 +126,8 @@ def read_scene(scene, parameters=None, *, size=None):
     Raises
     ------
     InputError
-        In one line with file and field: missing or malformed files, no or several sensors, a camera that is not
-        ``perspective`` or is cropped, a light or shape of an unsupported kind, a shape without texture
+        In one line with file and field: missing or malformed files, no or several sensors, a camera that is
+        not ``perspective`` or is cropped, a light or shape of an unsupported kind, a shape without texture
         coordinates, a missing BTF file.
     """
     import mitsuba as mi
@@ -231,7 +231,9 @@ def _material(parsed, shape):
     affine = to_uv[:2][:, [0, 1, 3]]
     if np.linalg.det(affine[:, :2]) <= 0:
         where = parsed.location(node)
-        raise InputError("the transform mirrors or is singular", file=where, field="to_uv", expected="a determinant > 0")
+        raise InputError(
+            "the transform mirrors or is singular", file=where, field="to_uv", expected="a determinant > 0"
+        )
     scale = float(props["scale"]) if "scale" in props else 1.0
     return plugin, BtfMaterial(props["filename"], filter_type, scale, affine, twosided)
 
@@ -270,6 +272,6 @@ def _light(kind, emitter):
     if kind == "directional":
         return Light(kind, np.array(sample.d, float), np.array(weight, float))
     position = np.array(sample.p, float)
-    point.p = (position + [1.0, 0.0, 0.0]).tolist()
+    point.p = (position + np.array([1.0, 0.0, 0.0])).tolist()
     sample, weight = emitter.sample_direction(point, [0.5, 0.5], True)
     return Light(kind, position, np.array(weight, float) * float(sample.dist) ** 2)

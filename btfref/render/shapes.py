@@ -8,7 +8,8 @@ import numpy as np
 
 from btfref.errors import InputError
 
-#: Segments of a full turn of a tessellated sphere, disk or cylinder: chords lie within 4e-5 radii of the surface.
+#: Segments of a full turn of a tessellated sphere, disk or cylinder: chords lie within 4e-5 radii of the
+#: surface.
 SEGMENTS = 384
 
 
@@ -25,7 +26,8 @@ class BtfMaterial:
     scale : float
         Factor on B.
     to_uv : ndarray, shape (2, 3)
-        Texture coordinates of the lookup are ``to_uv @ (u, v, 1)``; the linear part has a positive determinant.
+        Texture coordinates of the lookup are ``to_uv @ (u, v, 1)``; the linear part has a positive
+        determinant.
     twosided : bool
         Inside a ``twosided`` BSDF.
     """
@@ -38,7 +40,7 @@ class BtfMaterial:
 
     @property
     def rotation(self):
-        """Cosine and sine of the angle that local directions turn about the normal to reach the texture's frame.
+        """Cosine and sine of the turn about the normal that takes local directions to the texture's frame.
 
         The rotation nearest to the linear part of ``to_uv``, as in the plugin ``btf``.
         """
@@ -139,7 +141,7 @@ def neighbours(positions, faces):
 
 
 def coordinate_system(n):
-    """First tangent of Mitsuba's frame around unit vectors (Duff et al. 2017, listing 3), (..., 3) -> (..., 3)."""
+    """First tangent of Mitsuba's frame around unit vectors (Duff et al. 2017, listing 3), shape (..., 3)."""
     x, y, z = np.moveaxis(n, -1, 0)
     sign = np.copysign(1.0, z)
     a = -1.0 / (sign + z)
@@ -229,7 +231,8 @@ def _without_slivers(faces, positions):
 
 
 def _rectangle(props):
-    # u = (x + 1)/2, v = (y + 1)/2: rectangle.cpp of Mitsuba 3.9 (whose texture coordinate buffer says otherwise).
+    # u = (x + 1)/2, v = (y + 1)/2: rectangle.cpp of Mitsuba 3.9 (whose texture coordinate buffer says
+    # otherwise).
     uv, faces = _grid(1, 1)
     p = np.concatenate([2 * uv - 1, np.zeros((4, 1))], -1)
     return p, np.tile([0.0, 0.0, 1.0], (4, 1)), uv, faces, np.eye(4)

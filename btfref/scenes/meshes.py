@@ -1,8 +1,8 @@
 """The meshes of the shipped scenes; ``python -m btfref.scenes.meshes`` writes them again.
 
-Each is a smooth surface sampled on a regular grid of its parameters, with exact normals and with texture coordinates
-that are continuous inside the mesh. z is up; textures are placed so that one unit of uv is one unit of length where
-the surface is not stretched.
+Each is a smooth surface sampled on a regular grid of its parameters, with exact normals and with texture
+coordinates that are continuous inside the mesh. z is up; textures are placed so that one unit of uv is one
+unit of length where the surface is not stretched.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ _STEP = 1e-6
 def sphere(u, v):
     """Unit sphere; u ∈ [0, 2] around z, v ∈ [0, 1] from the south to the north pole; (...) -> (..., 3).
 
-    One tile of v spans the meridian; two tiles of u span the equator, so that texels are square there. At the poles
-    u is degenerate, as on every globe.
+    One tile of v spans the meridian; two tiles of u span the equator, so that texels are square there. At the
+    poles u is degenerate, as on every globe.
     """
     azimuth, polar = np.pi * u, np.pi * (1 - v)
     return np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], -1)
