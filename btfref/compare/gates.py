@@ -51,6 +51,19 @@ class GateResult:
         """The entry within the gate, ``"p999"``."""
         return self.name.rpartition(".")[2]
 
+    @property
+    def sign(self):
+        """Relation that the value must have to the limit."""
+        return "≥" if self.entry.startswith("min_") else "≤"
+
+    @property
+    def line(self):
+        """The result in one line, for a terminal or a test's message."""
+        where = f" [{self.pixel_class}]" if self.pixel_class else ""
+        value = "no value" if self.value is None else f"{self.value:.4g}"
+        detail = f" ({self.detail})" if self.detail else ""
+        return f"{self.outcome}: {self.name}{where} {value}, wanted {self.sign} {self.limit:g}{detail}"
+
     def to_dict(self):
         """JSON-able form."""
         return {
@@ -150,6 +163,4 @@ def _apply(name, measured, limit, reason, pixel_class):
             outcome, detail = "fail", detail or "not measured"
         else:
             outcome = "pass" if (value >= limit if lower else value <= limit) else "fail"
-            if outcome == "fail" and not detail:
-                detail = f"{value:.3g} is {'below' if lower else 'above'} {limit:g}"
     return GateResult(name, outcome in ("pass", "empty"), value, limit, reason, outcome, pixel_class, detail)

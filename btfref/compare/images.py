@@ -85,20 +85,20 @@ def save_image(path, image, *, display=None, attributes=None):
 
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(attributes or {})}
         channels = {"RGB": np.ascontiguousarray(image, np.float32)}
-        with _replacing(path) as temporary:
+        with replacing(path) as temporary:
             OpenEXR.File(header, channels).write(str(temporary))
     elif kind == ".png":
         from btfref.compare.png import encode_png
 
         encoded = (display or Display()).encoded(image)
-        with _replacing(path) as temporary:
+        with replacing(path) as temporary:
             temporary.write_bytes(encode_png(np.round(encoded * 255).astype(np.uint8)))
     else:
         raise InputError("unknown kind of picture", file=path, got=repr(path.suffix), expected=".exr or .png")
 
 
 @contextlib.contextmanager
-def _replacing(path):
+def replacing(path):
     """A temporary name beside `path` with its ending, moved over it on success and removed on failure."""
     if not path.parent.is_dir():
         raise InputError("no such folder", file=path.parent)
