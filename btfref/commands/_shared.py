@@ -106,26 +106,6 @@ def direction_set(text):
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
 
 
-def scene_file(text):
-    """Path of a scene: a file, or one of the scenes that btfref ships by its name.
-
-    Raises
-    ------
-    InputError
-        When it is neither.
-    """
-    path = Path(text)
-    if path.exists():
-        return path
-    shipped = Path(__file__).resolve().parent.parent / "scenes"
-    if (shipped / f"{text}.xml").is_file():
-        return shipped / f"{text}.xml"
-    names = sorted(p.stem for p in shipped.glob("*.xml") if not p.stem.startswith("lights"))
-    raise InputError(
-        "no such scene", file=text, expected=f"a Mitsuba scene file, or one of {', '.join(names)}"
-    )
-
-
 def output_file(text, *suffixes):
     """Path of an output, refused early when it cannot be written or has a suffix that no writer takes.
 

@@ -38,7 +38,7 @@ def lines(result):
     """The outcome for a reader."""
     rows = []
     for cell in result.cells:
-        failed = [gate.name for gate in cell.comparison.gates if not gate.passed]
+        failed = [gate.name for gate in cell.all_gates if not gate.passed]
         metrics = cell.comparison.metrics.get("interior") or cell.comparison.metrics["all"]
         errors = [number(metrics.get(name)) for name in ("rel_p999", "rel_max")]
         rows.append([cell.name, *errors, f"FAIL {', '.join(failed)}" if failed else "pass"])

@@ -12,10 +12,10 @@ from btfref.commands._shared import (
     emit,
     emit_json,
     output_file,
-    scene_file,
     size,
     write_images,
 )
+from btfref.scenes import scene_file
 
 
 def add_arguments(parser):

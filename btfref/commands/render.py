@@ -8,8 +8,9 @@ every representation: the flat shape replaced by the mesostructure itself, path 
 
 from __future__ import annotations
 
-from btfref.commands._shared import assignments, count, output_file, scene_file, size, write_images
+from btfref.commands._shared import assignments, count, output_file, size, write_images
 from btfref.errors import InputError
+from btfref.scenes import scene_file
 
 
 def add_arguments(parser):
