@@ -55,6 +55,12 @@ def required(name):
 
 
 @pytest.fixture(scope="session")
+def capabilities():
+    """The table that `need` looks into."""
+    return CAPABILITIES
+
+
+@pytest.fixture(scope="session")
 def need():
     """``need("gl")`` returns what was found; if missing it skips, or fails where BTFREF_REQUIRE says so."""
 

@@ -206,9 +206,9 @@ def _window_mean(x):
     weights /= weights.sum()
     for axis in (0, 1):
         size = x.shape[axis]
-        index = (np.arange(size)[:, None] + offsets) % (2 * size)
-        index = np.where(index < size, index, 2 * size - 1 - index)
-        x = sum(w * np.take(x, index[:, k], axis=axis) for k, w in enumerate(weights))
+        padding = [(5, 5) if k == axis else (0, 0) for k in range(x.ndim)]
+        padded = np.moveaxis(np.pad(x, padding, mode="symmetric"), axis, 0)
+        x = np.moveaxis(sum(w * padded[k : k + size] for k, w in enumerate(weights)), 0, axis)
     return x
 
 

@@ -125,4 +125,4 @@ def full_scale(signed, classes):
 def script_json(data):
     """JSON that may stand inside a ``<script>`` element; equal data give equal text."""
     text = json.dumps(json_safe(data), separators=(",", ":"), allow_nan=False)
-    return text.replace("</", "<\\/").replace("<!--", "<\\u0021--")
+    return text.replace("<", "\\u003c")

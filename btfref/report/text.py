@@ -9,7 +9,7 @@ OUTCOME = {
     "pass": ("✓", "pass"),
     "fail": ("✗", "fail"),
     "inconclusive": ("?", "inconclusive"),
-    "empty": ("–", "no such pixels"),
+    "empty": ("–", "no pixels"),
 }
 
 #: Metric → its row in the table of classes: label, explanation.

@@ -2,6 +2,8 @@
 
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -399,3 +401,47 @@ def test_a_failing_write_leaves_the_old_file(tmp_path, picture, monkeypatch):
         save_image(path, picture * 2)
     assert path.read_bytes() == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.png"]
+
+
+# --- what all tests share ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("operation", [lambda x: 1 / x, lambda x: x / x, lambda x: np.exp(x + 1e4)])
+def test_floating_point_errors_raise(operation):
+    with pytest.raises(FloatingPointError):
+        operation(np.zeros(2))
+    assert np.float64(1e-300) ** 2 == 0  # underflow is let through
+
+
+def test_a_missing_reference_fails_the_test(reference_file):
+    with pytest.raises(pytest.fail.Exception, match=r"nothing\.exr is missing"):
+        reference_file("nothing.exr")
+
+
+@pytest.mark.parametrize(
+    ("wanted", "outcome"), [("", pytest.skip.Exception), ("a, flux", pytest.fail.Exception)]
+)
+def test_requirements_are_skipped_or_demanded(need, capabilities, monkeypatch, wanted, outcome):
+    monkeypatch.setenv("BTFREF_REQUIRE", wanted)
+    monkeypatch.setitem(capabilities, "flux", lambda: None)
+    with pytest.raises(outcome, match="flux is not on this machine"):
+        need("flux")
+    monkeypatch.setitem(capabilities, "flux", lambda: "capacitor")
+    assert need("flux") == "capacitor"
+
+
+def test_import_is_light():
+    code = "import sys, btfref.compare, btfref.report; print(*sys.modules)"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    heavy = {
+        "mitsuba",
+        "drjit",
+        "moderngl",
+        "matplotlib",
+        "scipy",
+        "skimage",
+        "flip_evaluator",
+        "PIL",
+        "OpenEXR",
+    }
+    assert not set(found.stdout.split()) & heavy
