@@ -181,6 +181,9 @@ class _Job:
                 expected=f"one of {', '.join(ESTIMATORS)}",
             )
         self.dtype, self.estimator, self.variant = dtype, estimator, variant
+        # Every setting is tried before anything is written.
+        with mitsuba_variant(variant):
+            pass
         self.views, self.lights = directions(views), directions(lights)
         self.mesostructure = build(mesostructure, **parameters)
         self.attributes = {
