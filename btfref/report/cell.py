@@ -71,11 +71,19 @@ class Cell:
 
     @property
     def pair(self):
-        """Labels of the two pictures shown first."""
+        """Labels of the two pictures shown first: what the comparison took as reference, and as test."""
         labels = list(self.images)
-        first = "reference" if "reference" in labels else labels[0]
+        first = self._label_of("reference") or ("reference" if "reference" in labels else labels[0])
         others = [label for label in labels if label != first]
-        return first, next((x for x in ("realtime", "test") if x in others), others[0] if others else first)
+        usual = [label for label in ("realtime", "test") if label in others]
+        test = self._label_of("test")
+        return first, test if test in others else [*usual, *others, first][0]
+
+    def _label_of(self, side):
+        """The picture that is one side of the comparison."""
+        picture = getattr(self.comparison, side, None)
+        same = (k for k, v in self.images.items() if picture is not None and np.array_equal(v, picture, True))
+        return next(same, None)
 
     def check(self):
         """Raise InputError when the pictures and the comparison are not of one shape."""

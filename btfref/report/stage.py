@@ -92,6 +92,7 @@ def _stage(index, cell):
         pixels |= _maps(cell.comparison)
         charts = _charts(cell.comparison, limits)
     first, second = cell.pair
+    pixels["pair"] = [LABELS.get(key, (key,))[0] for key in (second, first)]
     viewer = (
         asset("viewer.html").replace("{{A}}", _options(cell, first)).replace("{{B}}", _options(cell, second))
     )

@@ -137,6 +137,18 @@ def test_outcomes(cells):
     assert report_data("t", cells, {})["passed"] is False
 
 
+def test_cell_shows_what_was_compared(rng):
+    reference, test, truth, _ = pictures(rng)
+    named = {"realtime": test, "truth": truth, "reference": reference}
+    assert Cell("a", named).pair == ("reference", "realtime")
+    assert Cell("a", named, compare(test, reference)).pair == ("reference", "realtime")
+    assert Cell("a", named, compare(reference, truth)).pair == ("truth", "reference")
+    assert Cell("a", {"x": test}).pair == ("x", "x")
+    assert Cell("a", {"x": test, "y": truth}, compare(test, test)).pair == ("x", "y")
+    broken = np.full_like(test, np.nan)
+    assert Cell("a", {"x": broken, "y": test}, compare(broken, test)).pair == ("y", "x")
+
+
 def test_report_is_self_contained(tmp_path, cells):
     html = write_report(tmp_path / "r.html", title="t", cells=cells, facts=FACTS).read_text("utf-8")
     assert not re.findall(r"https?://|@import|<link(?! rel=\"icon\" href=\"data:)|<script[^>]+src", html)
@@ -246,6 +258,7 @@ DRIVER = """
   found.zoom = q(".zoom-out").textContent;
   const scale = q(".map input"), ticks = () => q(".map .ticks").textContent, before = ticks();
   scale.value = Number(scale.value) + 3; scale.dispatchEvent(new Event("input"));
+  found.note = q(".map figcaption .muted").textContent;
   found.rescaled = before !== ticks();
   document.getElementById("theme").click(); document.getElementById("theme").click();
   found.theme = root.dataset.theme;
@@ -314,6 +327,7 @@ def test_page_works_in_a_browser(tmp_path, cells, need, width):
     assert found["tag"] == "Geometry truth"
     assert found["zoom"] == "2×"
     assert found["rescaled"] is True
+    assert found["note"].startswith("Real-time − Reference, gain ")
     assert found["theme"] == "dark"
 
 

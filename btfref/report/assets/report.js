@@ -191,7 +191,7 @@
       if (start < 0) start = steps.length - 1;
       slider(scale, "full scale of the difference", steps.length, start, (k) => {
         const full = steps[k];
-        note(`test − reference, gain ${show(1 / full)}×`);
+        note(`${data.pair.join(" − ")}, gain ${show(1 / full)}×`);
         bar(scale, "diverging", [[0, `−${show(full)}`], [0.5, "0"], [1, `+${show(full)}`]]);
         draw((v, i) => (v[i] === 0 && background(i) ? [0, 0, 0, 0] : [...look("diverging", 0.5 + v[i] / (2 * full)), 255]));
       });
