@@ -185,7 +185,7 @@ def triangles_of(shape, node, *, file):
             raise InputError("the shape has no texture coordinates", file=file, field=name, got=plugin)
         arrays = mi.traverse(shape)
         normals = None
-        if shape.has_vertex_normals() and not shape.has_face_normals():
+        if shape.has_vertex_normals():
             normals = np.array(arrays["vertex_normals"]).reshape(-1, 3)
         return common | {
             "positions": np.array(arrays["vertex_positions"]).reshape(-1, 3),

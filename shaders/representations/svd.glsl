@@ -10,24 +10,39 @@
 uniform sampler2DArray basis;
 uniform sampler2DArray weights;
 
+// The upper 12 bits of x and what they leave. Bits are masked, because compilers cancel the terms of Veltkamp's
+// splitting, and GLSL 3.30 has no "precise".
+vec2 split(float x) {
+    float high = intBitsToFloat(floatBitsToInt(x) & ~0xfff);
+    return vec2(high, x - high);
+}
+
+// Blended weight of component c, in two parts.
+vec2 blended_weight(Stencil texels, int c) {
+    vec4 stored = vec4(0.0);
+    for (int x = 0; x < 4; ++x) {
+        if (texels.weight[x] != 0.0) {
+            stored[x] = table_fetch(weights, texels.index[x] * WEIGHTS_STRIDE + (c >> 2))[c & 3];
+        }
+    }
+    // Terms share 12 bits of the filter's weights, so that each product with a half is exact.
+    vec2 a = split(texels.weight.x), b = split(texels.weight.y);
+    vec2 d = split(texels.weight.z), e = split(texels.weight.w);
+    vec4 terms = vec4(a.x, b.x, d.x, e.x) * stored;
+    float high = split((terms.x + terms.y) + (terms.z + terms.w)).x;
+    float rest = (((terms.x - high) + terms.y) + terms.z) + terms.w;
+    return vec2(high, rest + dot(vec4(a.y, b.y, d.y, e.y), stored));
+}
+
 vec3 btf_eval(vec2 uv, vec3 w_light, vec3 w_view, float lod) {
     if (!directions_valid(w_light, w_view)) {
         return vec3(0.0);
     }
     // The basis does not depend on the texel, so that the weights may be blended first.
     Stencil texels = texel_stencil(uv, WEIGHTS_DIM0, WEIGHTS_DIM1);
-    float coefficient[PACKET_COLOURS];
+    vec2 coefficient[PACKET_COLOURS];
     for (int c = 0; c < PACKET_COLOURS; ++c) {
-        coefficient[c] = 0.0;
-    }
-    for (int x = 0; x < 4; ++x) {
-        if (texels.weight[x] == 0.0) {
-            continue;
-        }
-        for (int c = 0; c < PACKET_COLOURS; ++c) {
-            vec4 packet = table_fetch(weights, texels.index[x] * WEIGHTS_STRIDE + (c >> 2));
-            coefficient[c] += texels.weight[x] * packet[c & 3];
-        }
+        coefficient[c] = blended_weight(texels, c);
     }
     Stencil views = view_stencil(w_view);
     Stencil lights = light_stencil(w_light);

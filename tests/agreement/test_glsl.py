@@ -1,0 +1,175 @@
+"""The GLSL ports: they compile for both targets, and agree with the float64 definition point by point."""
+
+import subprocess
+
+import numpy as np
+import pytest
+from oracle import oracle_btf
+
+from btfref.compare import agreement
+from btfref.numerics.directions import directions
+from btfref.registry import methods
+from btfref.render import composer, gl
+from btfref.render.probe import broadcast_points, probe
+
+#: Sets of directions: rings, rings with shifted azimuths, and sets without a pole or rings of their own.
+DIRECTIONS = {
+    "rings": ("ubo81", "ubo81"),
+    "shifted rings": ("ubo151", "ubo81"),
+    "triangles": ("10x5", "16x8"),
+}
+
+#: Quick settings, where the defaults are made for larger data.
+SETTINGS = {"lpca": {"clusters": 5, "components": 3}}
+
+N_POINTS = 20_000
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """``fitted(method, directions) -> Representation`` of the oracle, made once."""
+    made = {}
+
+    def get(key, kind):
+        if (key, kind) not in made:
+            views, lights = DIRECTIONS[kind]
+            btf = oracle_btf((10, 12), views, lights)
+            made[key, kind] = methods()[key].fit(btf, **SETTINGS.get(key, {}))
+        return made[key, kind]
+
+    return get
+
+
+def points(rng, views, lights, n=N_POINTS):
+    """Ordinary and awkward (uv, w_light, w_view), rounded to float32: what both evaluators are given."""
+
+    def around(spec):
+        samples = directions(spec).vectors
+        z = rng.uniform(0, 1, n)
+        phi = rng.uniform(-np.pi, np.pi, n)
+        kind = rng.integers(0, 8, n)
+        z = np.where(kind == 0, 10 ** rng.uniform(-8, -2, n), z)  # grazing
+        z = np.where(kind == 1, 1 - 10 ** rng.uniform(-7, -2, n), z)  # about the pole
+        r = np.sqrt(1 - z * z)
+        w = np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
+        exact = samples[rng.integers(0, len(samples), n)]
+        w = np.where((kind == 2)[:, None], exact, w)
+        # Beside a sample, by about float32's rounding and more.
+        beside = exact + rng.normal(size=(n, 3)) * 10 ** rng.uniform(-8, -3, (n, 1))
+        w = np.where((kind == 3)[:, None], beside, w)
+        # The seam of the azimuth, where phi jumps from +pi to -pi, and its other end at phi = 0.
+        w[:, 1] *= np.where(kind == 4, 1e-7, 1)
+        w[:, 2] = np.maximum(w[:, 2], 1e-9)
+        return w / np.linalg.norm(w, axis=1, keepdims=True)
+
+    uv = rng.uniform(-3, 3, (n, 2))
+    kind = rng.integers(0, 6, n)[:, None]
+    uv = np.where(kind == 0, rng.integers(-24, 24, (n, 2)) / 24, uv)  # centres and borders of texels
+    uv = np.where(kind == 1, rng.uniform(-300, 300, (n, 2)), uv)
+    return broadcast_points(uv, around(lights), around(views))[0][:, :8]
+
+
+def split(rows):
+    return rows[:, 0:2], rows[:, 2:5], rows[:, 5:8]
+
+
+@pytest.mark.parametrize("kind", DIRECTIONS)
+@pytest.mark.parametrize("key", methods())
+def test_probe_agrees_with_the_definition(need, rng, fitted, key, kind):
+    need("gl")
+    rep = fitted(key, kind)
+    uv, w_light, w_view = split(points(rng, *DIRECTIONS[kind]))
+    definition = rep.evaluate(uv, w_light, w_view)
+    for result in agreement(probe(rep, uv, w_light, w_view), definition).gates:
+        assert result.passed, result.line
+
+
+@pytest.mark.parametrize("key", methods())
+def test_nearest_texel(need, rng, fitted, key):
+    need("gl")
+    rep = fitted(key, "rings")
+    uv, w_light, w_view = split(points(rng, *DIRECTIONS["rings"], n=5000))
+    # On a border of texels either side is right: stay inside.
+    column = np.mod(uv.astype(float) * [12, 10], 1)
+    inside = (abs(column - 0.5) < 0.49).all(1)
+    uv, w_light, w_view = uv[inside], w_light[inside], w_view[inside]
+    nearest = type(rep).from_arrays(rep.arrays(), {**rep.meta, "filter_type": "nearest"})
+    definition = nearest.evaluate(uv, w_light, w_view)
+    assert not np.allclose(definition, rep.evaluate(uv, w_light, w_view))
+    for result in agreement(probe(rep, uv, w_light, w_view, filter_type="nearest"), definition).gates:
+        assert result.passed, result.line
+
+
+@pytest.mark.parametrize("key", methods())
+@pytest.mark.parametrize("kind", ["rings", "triangles"])
+def test_below_the_horizon_is_exactly_zero(need, fitted, key, kind):
+    need("gl")
+    up, down, level = [0.6, 0, 0.8], [0.6, 0, -0.8], [1, 0, 0]
+    bad = [down, level, [np.nan, 0, 1], [0, 0, np.inf], [0, 0, 3], [0, 0, 0]]
+    w_light = np.array([*bad, *[up] * len(bad), up])
+    w_view = np.array([*[up] * len(bad), *bad, up])
+    values = probe(fitted(key, kind), [0.3, 0.4], w_light, w_view)
+    assert (values[:-1] == 0).all()
+    assert (values[-1] != 0).all()
+
+
+@pytest.mark.parametrize("key", methods())
+def test_coordinates_that_are_not_finite_count_as_zero(need, fitted, key):
+    need("gl")
+    rep = fitted(key, "rings")
+    up = [0, 0, 1]
+    values = probe(rep, [[np.nan, 0.5], [np.inf, 0.5], [0, 0.5]], up, up)
+    assert (values == values[2]).all()
+    assert np.isfinite(values).all()
+
+
+def test_a_lost_piece_fails_the_probe(need, rng, fitted, tmp_path, monkeypatch):
+    """The gate can fail: Mesa's own atan, which is good to 1e-5, is already too coarse."""
+    need("gl")
+    from btfref.platform import shader_directory
+
+    text = (shader_directory() / "lib/angles.glsl").read_text()
+    coarse = text.replace("return x + x * z * p;", "return atan(x) + 3e-6 * x;")
+    assert coarse != text
+    (tmp_path / "lib").mkdir()
+    (tmp_path / "lib/angles.glsl").write_text(coarse)
+    rep = fitted("raw", "rings")
+    shader, _ = gl.shader_file(rep)
+    monkeypatch.setattr(gl, "shader_file", lambda rep: (shader, [tmp_path]))
+    uv, w_light, w_view = split(points(rng, *DIRECTIONS["rings"]))
+    found = agreement(probe(rep, uv, w_light, w_view), rep.evaluate(uv, w_light, w_view))
+    assert not found.passed
+
+
+STAGES = [("hosts/probe.vert", "hosts/probe.frag"), ("hosts/mesh.vert", "hosts/mesh.frag")]
+
+
+@pytest.mark.parametrize("target", composer.TARGETS)
+@pytest.mark.parametrize("kind", ["rings", "triangles"])
+@pytest.mark.parametrize("key", methods())
+def test_glslang_accepts_every_representation_in_every_host(need, fitted, tmp_path, key, kind, target):
+    validator = need("glslang")
+    rep = fitted(key, kind)
+    shader, directories = gl.shader_file(rep)
+    for filter_type in ("bilinear", "nearest"):
+        defines = {**gl.shader_defines(rep, filter_type=filter_type), "N_LIGHTS": 3}
+        for pair in STAGES:
+            files, sources = [], []
+            for name in pair:
+                source = composer.compose(
+                    name, defines, representation=shader, directories=directories, target=target
+                )
+                path = tmp_path / name.replace("/", "_")
+                path.write_text(source, encoding="utf-8")
+                files.append(str(path))
+                sources.append(source)
+            # -l links the stages: their interfaces must match too.
+            done = subprocess.run([validator, "-l", *files], capture_output=True, text=True, check=False)
+            assert done.returncode == 0, "\n".join(source.explain(done.stdout) for source in sources)
+
+
+def test_glslang_refuses_a_broken_shader(need, tmp_path):
+    validator = need("glslang")
+    path = tmp_path / "broken.frag"
+    path.write_text(composer.compose("hosts/probe.frag") + "oops\n")
+    assert subprocess.run([validator, str(path)], capture_output=True, check=False).returncode != 0
