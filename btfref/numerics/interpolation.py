@@ -136,7 +136,8 @@ class TriangleInterpolation:
         weight = weight / weight.sum(-1, keepdims=True)
         if not hold:
             edge = weight[..., :1] * row[..., 0:3] + weight[..., 1:2] * row[..., 3:6]
-            cos_edge = edge[..., 2] / np.linalg.norm(edge, axis=-1)
+            length = np.linalg.norm(edge, axis=-1)
+            cos_edge = edge[..., 2] / np.where(length > 0, length, 1)
             fade = np.maximum(w[..., 2], 0) / np.maximum(cos_edge, 1e-6)
             weight = weight * np.where(beyond, np.minimum(fade, 1), 1)[..., None]
         return np.maximum(row[..., 15:18], 0).astype(np.int64), weight
