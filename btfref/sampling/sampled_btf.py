@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +10,8 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.directions import DirectionSet, checked
-from btfref.sampling.store import TILE, create_store, open_store, refuse_existing, remove_leftovers
+from btfref.sampling.layout import TILE, refuse_existing, remove_leftovers, replace_store
+from btfref.sampling.store import create_store, open_store
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,44 +148,3 @@ class SampledBTF:
             replace_store(draft, path)
         finally:
             shutil.rmtree(draft, ignore_errors=True)
-
-
-def replace_store(draft, path):
-    """Give a finished store its name, in place of an older *store* of that name; other things are kept.
-
-    Parameters
-    ----------
-    draft, path : path-like
-
-    Raises
-    ------
-    InputError
-        Something else than a sampled BTF has that name.
-    """
-    path = Path(path)
-    if path.exists() or path.is_symlink():
-        remove_store(path)
-    os.rename(draft, path)
-
-
-def remove_store(path):
-    """Remove a sampled BTF; refuses anything that is not one.
-
-    Parameters
-    ----------
-    path : path-like
-
-    Raises
-    ------
-    InputError
-        Something else than a sampled BTF has that name.
-    """
-    path = Path(path)
-    header = path / "zarr.json"
-    if path.is_symlink() or not header.is_file() or b'"sampled-btf"' not in header.read_bytes():
-        raise InputError("exists and is not a BTF store; it is left alone", file=path)
-    # Renamed first, so that a kill in the middle leaves no store that has lost some of its files.
-    removed = path.with_name(path.name + ".removed.partial")
-    shutil.rmtree(removed, ignore_errors=True)
-    os.rename(path, removed)
-    shutil.rmtree(removed)

@@ -1,114 +1,24 @@
-"""The file of a sampled BTF: a Zarr v3 directory ``NAME.btf.zarr``, written view by view and resumable.
-
-======== ============================== =============== ================================================
-array    shape                          type            chunks
-======== ============================== =============== ================================================
-values   view, light, row, column, 3    float16/float32 one (view, light, tile); one file holds a view
-variance the same                       float32         the same; variance of the mean of each value
-coverage view, light, tile row, column  uint8           one view; 1 where values (and variance) are there
-views    view, 3                        float64         whole
-lights   light, 3                       float64         whole
-======== ============================== =============== ================================================
-
-A view is one shard (one file): it is written at once, under a temporary name first. Inner chunks carry a
-checksum and are read alone by byte ranges. Coverage is written after the values it vouches for, so that a
-killed run never looks complete. Attributes hold every convention; nothing in the store depends on the time
-or on the number of attempts.
-
-Chunks are uncompressed: on noisy half floats zstd saves 15 % and doubles the time of reading. Tiles of 64²
-keep a 64² · 81² BTF at one inner chunk a pair (read whole in 1.3 s, in 4.0 s with tiles of 32²: the cost is
-per chunk).
-"""
+"""A sampled BTF on disk: parts of it read, views of it written; `layout` says what the files are."""
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from pathlib import Path
 
 import numpy as np
 
-from btfref.conventions import AXES, COLOUR_SPACE, COSINE_CONVENTION, SCHEMA_VERSION, UNITS
 from btfref.errors import InputError
 from btfref.numerics.directions import checked
-
-#: Texels along one side of an inner chunk.
-TILE = 64
-
-KIND = "sampled-btf"
-
-#: Attributes that every store has, with the only value that this version writes and reads.
-CONVENTIONS = {
-    "kind": KIND,
-    "cosine_convention": COSINE_CONVENTION,
-    "colour_space": COLOUR_SPACE,
-    "axes": list(AXES),
-    "units": UNITS,
-    "texels": "row 0 at v = 0, centres at (i + 1/2)/n, wrap-around",
-    "interpolation": "rings: linear in phi and theta; scattered: spherical Delaunay, barycentric",
-    "variance": "variance of the mean of each value; quantization to the stored type not included",
-}
-
-_SUFFIX = ".partial"
-
-
-def _zarr():
-    import zarr
-
-    return zarr
-
-
-def attributes_of(path):
-    """Attributes of a store, read from its header alone.
-
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    dict
-
-    Raises
-    ------
-    InputError
-        Not a sampled BTF, or one of another convention or a newer schema.
-    """
-    path = Path(path)
-    header = path / "zarr.json"
-    if not path.exists():
-        raise InputError("no such file", file=path)
-    if not path.is_dir() or not header.is_file():
-        raise InputError("not a BTF store", file=path, expected="a Zarr v3 directory with zarr.json")
-    try:
-        attributes = json.loads(header.read_text(encoding="utf-8"))["attributes"]
-        kind = attributes.get("kind")
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            "header cannot be read", file=path, field="zarr.json", got=error, expected="JSON"
-        ) from None
-    if kind != KIND:
-        raise InputError("not a BTF store", file=path, field="kind", got=repr(kind), expected=repr(KIND))
-    version = attributes.get("schema_version")
-    if not isinstance(version, int) or version > SCHEMA_VERSION or version < 1:
-        raise InputError(
-            "schema that this version cannot read",
-            file=path,
-            field="schema_version",
-            got=version,
-            expected=f"1 to {SCHEMA_VERSION}",
-        )
-    for key in ("cosine_convention", "colour_space", "axes", "units"):
-        if attributes.get(key) != CONVENTIONS[key]:
-            raise InputError(
-                "store of another convention",
-                file=path,
-                field=key,
-                got=attributes.get(key),
-                expected=CONVENTIONS[key],
-            )
-    return attributes
+from btfref.sampling.layout import (
+    DRAFT,
+    KIND,
+    TILE,
+    attributes_of,
+    check_finite,
+    refuse_existing,
+    write_headers,
+)
 
 
 def create_store(path, *, views, lights, texels, dtype="float16", variance=True, tile=TILE, attributes=None):
@@ -144,63 +54,11 @@ def create_store(path, *, views, lights, texels, dtype="float16", variance=True,
     if not path.absolute().parent.is_dir():
         raise InputError("no such folder", file=path.parent)
     # A fixed name: what a killed run left is found and removed by the next one.
-    draft = path.with_name(path.name + _SUFFIX)
+    draft = path.with_name(path.name + DRAFT)
     shutil.rmtree(draft, ignore_errors=True)
-    _write_headers(draft, views, lights, texels, dtype, variance, tile, attributes)
+    write_headers(draft, views, lights, texels, dtype, variance, tile, attributes)
     os.rename(draft, path)
     return BTFStore(path)
-
-
-def refuse_existing(path):
-    """InputError when the path is taken."""
-    if path.exists() or path.is_symlink():
-        raise InputError("exists already", file=path, expected="a new name (or to overwrite)")
-
-
-def _write_headers(path, views, lights, texels, dtype, variance, tile, attributes):
-    if dtype not in ("float16", "float32"):
-        raise InputError("type of the values", field="dtype", got=repr(dtype), expected="float16 or float32")
-    zarr = _zarr()
-    rows, columns = texels
-    n_views, n_lights = len(views), len(lights)
-    tile_rows, tile_columns = min(tile, rows), min(tile, columns)
-    n_tiles = -(-rows // tile_rows), -(-columns // tile_columns)
-    conventions = {"schema_version": SCHEMA_VERSION, **CONVENTIONS}
-    names = {"directions": {"views": views.name, "lights": lights.name}}
-    group = zarr.create_group(
-        store=str(path), zarr_format=3, attributes={**(attributes or {}), **names, **conventions}
-    )
-    # NaN stands for "not there": no stored value equals it, so that a lost file cannot pass for black texels.
-    for name, kind in (("values", dtype), ("variance", "float32")) if variance else (("values", dtype),):
-        group.create_array(
-            name,
-            shape=(n_views, n_lights, rows, columns, 3),
-            dtype=kind,
-            chunks=(1, 1, tile_rows, tile_columns, 3),
-            # A shard holds whole inner chunks, so it may reach beyond the last row and column.
-            shards=(1, n_lights, n_tiles[0] * tile_rows, n_tiles[1] * tile_columns, 3),
-            compressors=zarr.codecs.Crc32cCodec(),
-            fill_value=float("nan"),
-            dimension_names=list(AXES),
-        )
-    group.create_array(
-        "coverage",
-        shape=(n_views, n_lights, *n_tiles),
-        dtype="uint8",
-        chunks=(1, n_lights, *n_tiles),
-        compressors=zarr.codecs.Crc32cCodec(),
-        fill_value=0,
-        dimension_names=["view", "light", "tile_row", "tile_column"],
-    )
-    for name, vectors in (("views", views.vectors), ("lights", lights.vectors)):
-        array = group.create_array(
-            name,
-            shape=vectors.shape,
-            dtype="float64",
-            compressors=zarr.codecs.Crc32cCodec(),
-            fill_value=float("nan"),
-        )
-        array[:] = vectors
 
 
 def open_store(path):
@@ -222,24 +80,6 @@ def open_store(path):
     return BTFStore(path)
 
 
-def remove_leftovers(path):
-    """Remove what killed runs left: drafts beside a store and temporary files inside it.
-
-    Parameters
-    ----------
-    path : path-like
-        The store's final name; it need not exist.
-    """
-    path = Path(path)
-    if path.absolute().parent.is_dir():
-        for draft in path.absolute().parent.iterdir():
-            if draft.name.startswith(path.name + ".") and draft.name.endswith(_SUFFIX) and draft.is_dir():
-                shutil.rmtree(draft, ignore_errors=True)
-    if path.is_dir():
-        for leftover in path.rglob("*" + _SUFFIX):
-            leftover.unlink(missing_ok=True)
-
-
 class BTFStore:
     """A sampled BTF on disk.
 
@@ -257,11 +97,13 @@ class BTFStore:
     """
 
     def __init__(self, path, *, store=None):
+        import zarr
+
         self.path = Path(path)
         self.attributes = attributes_of(self.path)
-        self._group = self._guard("zarr.json", lambda: _zarr().open_group(store or str(self.path), mode="r+"))
+        self._group = self._guard("zarr.json", lambda: zarr.open_group(store or str(self.path), mode="r+"))
         self._values = self._array("values", 5)
-        self.has_variance = (self.path / "variance").is_dir()
+        self.has_variance = "variance" in self.attributes.get("arrays", ())
         self._variance = self._array("variance", 5) if self.has_variance else None
         self._coverage = self._array("coverage", 4)
         names = self.attributes.get("directions", {})
@@ -459,18 +301,3 @@ def _selection(name, index, n):
     if (np.diff(chosen) == 1).all():
         return slice(int(chosen[0]), int(chosen[-1]) + 1)
     return chosen
-
-
-def check_finite(values, path, field):
-    """InputError with the place of the first value that is NaN or infinite."""
-    # Slab by slab: a full boolean copy of a large BTF would not be small.
-    for index, slab in enumerate(values):
-        if not np.isfinite(slab).all():
-            place = np.argwhere(~np.isfinite(slab))[0].tolist()
-            raise InputError(
-                "value that is not finite (or beyond the type's range)",
-                file=path,
-                field=f"{field}[{', '.join(map(str, [index, *place]))}]",
-                got=slab[tuple(place)] if place else slab,
-                expected="finite",
-            )

@@ -12,15 +12,9 @@ import numpy as np
 from btfref.errors import InputError
 from btfref.mesostructure import build
 from btfref.numerics.directions import directions
-from btfref.sampling.sampled_btf import SampledBTF, remove_store
-from btfref.sampling.store import (
-    CONVENTIONS,
-    TILE,
-    check_finite,
-    create_store,
-    open_store,
-    remove_leftovers,
-)
+from btfref.sampling.layout import CONVENTIONS, TILE, check_finite, remove_leftovers, remove_store
+from btfref.sampling.sampled_btf import SampledBTF
+from btfref.sampling.store import create_store, open_store
 from btfref.sampling.variant import mitsuba_variant
 from btfref.versions import versions
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ import pytest
 from btfref.errors import InputError
 from btfref.numerics.directions import directions
 from btfref.sampling import SampledBTF, open_store
-from btfref.sampling.store import BTFStore, create_store, remove_leftovers
+from btfref.sampling.layout import remove_leftovers
+from btfref.sampling.store import BTFStore, create_store
 
 VIEWS, LIGHTS = directions("2x3"), directions("2x4")
 
@@ -181,6 +183,15 @@ def test_damaged_values_are_refused(tmp_path, rng, damage):
     assert "\n" not in str(error.value)
     # Views in other files stay readable.
     SampledBTF.load(path, views=[0, 1])
+
+
+@pytest.mark.parametrize("name", ["values", "variance", "coverage", "views", "lights"])
+def test_a_lost_array_is_named(tmp_path, rng, name):
+    path, _ = _saved(tmp_path, rng)
+    shutil.rmtree(path / name)
+    with pytest.raises(InputError) as error:
+        SampledBTF.load(path)
+    assert (error.value.file, error.value.field) == (path, name)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
