@@ -80,6 +80,7 @@ def demo(output="output/demo", *, progress=None):
     -------
     DemoResult
     """
+    from btfref.compare import save_image
     from btfref.report import write_report
 
     chain = _Chain(Path(output), progress or (lambda done, total, label: None))
@@ -87,16 +88,46 @@ def demo(output="output/demo", *, progress=None):
     chain.make_material()
     jobs = [(METHODS[0], scene, lights) for scene in SCENES for lights in LIGHTS]
     jobs += [(method, "sphere", "directional1") for method in METHODS[1:]]
-    cells = []
+    rendered, against = {}, {}
     for done, job in enumerate(jobs):
         chain.progress(done, len(jobs), "rendering")
-        cells.append(chain.renderers_cell(*job))
+        rendered[job] = chain.renderers_cell(*job)
     chain.progress(len(jobs), len(jobs), "rendering")
-    cells += [chain.geometry_cell(method, "directional1") for method in (METHODS[-1], METHODS[0])]
+    for method in (METHODS[-1], METHODS[0]):
+        against[method] = chain.geometry_cell(method, "directional1")
+    cells = [*rendered.values(), *against.values()]
     report = chain.output / "report.html"
     with chain.timed("report"):
+        save_image(chain.output / "demo.png", overview(rendered, against))
         write_report(report, title="btfref demo", cells=cells, facts=chain.facts())
     return DemoResult(cells, report, chain.seconds)
+
+
+def overview(rendered, against):
+    """Eight pictures in two rows, for the README.
+
+    Parameters
+    ----------
+    rendered : dict of (method, scene, lights) to Cell
+    against : dict of method to Cell
+
+    Returns
+    -------
+    ndarray, shape (2 H, 4 W, 3)
+        Above, the plane: geometry truth, uncompressed, compressed, that in real time. Below, compressed:
+        sphere and cloth, each reference and real time. Linear radiance.
+    """
+    import numpy as np
+
+    best, raw = METHODS[0], METHODS[-1]
+    plane = rendered[best, FLAT, "directional1"].images
+    flat = [plane["truth"], against[raw].images["reference"], plane["reference"], plane["realtime"]]
+    curved = [
+        rendered[best, scene, "directional3"].images[side]
+        for scene in ("sphere", "cloth")
+        for side in ("reference", "realtime")
+    ]
+    return np.concatenate([np.concatenate(row, axis=1) for row in (flat, curved)])
 
 
 @dataclass
