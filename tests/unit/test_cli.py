@@ -2,9 +2,12 @@
 
 import json
 import os
+import re
+import shlex
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -338,3 +341,18 @@ def test_info_of_images(tmp_path, capsys):
         facts = json.loads(capsys.readouterr().out)
         assert facts["size"] == [5, 3]
         assert sorted(facts["channels"]) == ["B", "G", "R"]
+
+
+def readme_commands():
+    """The command lines that the README shows."""
+    text = (Path(__file__).parents[2] / "README.md").read_text()
+    return re.findall(r"^btfref .*$", text, re.MULTILINE)
+
+
+def test_the_readme_shows_commands():
+    assert len(readme_commands()) >= 5
+
+
+@pytest.mark.parametrize("line", readme_commands())
+def test_readme_commands_are_understood(line):
+    assert callable(build_parser().parse_args(shlex.split(line)[1:]).run)
