@@ -173,10 +173,14 @@ def install(requirements, run=subprocess.run):
         prefix = ["sudo", "-n"]
     apt = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get"]
     # Lists may be absent (container images) or stale: refresh, and let the installation itself decide.
-    run([*apt, "update", "-qq"], stdout=subprocess.DEVNULL)
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+    run([*apt, "update", "-qq"], **quiet)
     listing = run(["apt-cache", "pkgnames", "libllvm"], capture_output=True, text=True).stdout or ""
     wanted = packages(requirements, listing)
     command = [*apt, "install", "-y", "-qq", "--no-install-recommends", *wanted]
-    if run(command, stdout=subprocess.DEVNULL).returncode != 0 or any(not r.present() for r in requirements):
-        raise trouble
+    done = run(command, **quiet)
+    if done.returncode != 0 or any(not requirement.present() for requirement in requirements):
+        # What apt complained of, its own warnings left out.
+        said = [line for line in (done.stderr or "").splitlines() if line.startswith("E: ")]
+        raise MissingDependencyError(" ".join([trouble.what, *said[-1:]]), trouble.mend)
     return wanted

@@ -10,9 +10,11 @@ from pathlib import Path
 from btfref.errors import InputError
 
 
-def emit(text=""):
-    """Write one line to standard output."""
+def emit(text="", *, flush=False):
+    """Write one line to standard output; `flush` before work that takes long or writes by itself."""
     sys.stdout.write(f"{text}\n")
+    if flush:
+        sys.stdout.flush()
 
 
 def emit_json(data):

@@ -73,14 +73,14 @@ def _mend(for_tests):
 
     needed = system.missing()
     if needed:
-        emit(f"installing {', '.join(requirement.name for requirement in needed)}")
+        emit(f"installing {', '.join(requirement.name for requirement in needed)}", flush=True)
         emit(f"installed {' '.join(system.install(needed))}")
     if not for_tests:
         return 0
     for requirement in system.missing(tests=True):
         # One by one, and without failing: a distribution may lack one, and its tests then say why they skip.
         try:
-            emit(f"installing {requirement.name}")
+            emit(f"installing {requirement.name}", flush=True)
             system.install([requirement])
         except MissingDependencyError as error:
             sys.stderr.write(f"btfref: warning: {error}; the tests that need it are skipped\n")

@@ -207,9 +207,8 @@ class FakeApt:
         self.commands.append(command)
         self.installed = self.installed or "install" in command
         status = self.sudo if command == ["sudo", "-n", "true"] else 0
-        return subprocess.CompletedProcess(
-            command, status, stdout=self.listing if "pkgnames" in command else ""
-        )
+        output = self.listing if "pkgnames" in command else ""
+        return subprocess.CompletedProcess(command, status, output, "W: old lists\nE: no space\n")
 
 
 def requirements(apt):
@@ -255,7 +254,7 @@ def test_a_failed_installation_is_an_error(monkeypatch):
     absent = [system.Requirement("libEGL", ("libegl1",), lambda: False)]
     monkeypatch.setattr(system.shutil, "which", lambda name: f"/usr/bin/{name}")
     monkeypatch.setattr(system.os, "geteuid", lambda: 0)
-    with pytest.raises(MissingDependencyError, match="libegl1"):
+    with pytest.raises(MissingDependencyError, match=r"E: no space; run: .*libegl1"):
         system.install(absent, run=apt)
 
 
