@@ -106,9 +106,8 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
 
                 mitsuba_plugins.register()
             parsed = parsing.parse(scene, parameters, variant=variant, size=size)
-            for node in parsed.nodes:
-                if parsing.is_kind(node, "Film"):
-                    _plain_film(parsed, node)
+            for index in [i for i, node in enumerate(parsed.nodes) if parsing.is_kind(node, "Film")]:
+                _plain_film(parsed, index)
             btf_shapes = _btf_shapes(parsed)
             made = parsed.instantiate()
             if not isinstance(made, mi.Scene):
@@ -145,23 +144,25 @@ def _demand_texture_coordinates(made, btf_shapes):
             raise InputError("the shape has no texture coordinates", file=place, field=shape.id())
 
 
-def _plain_film(parsed, film):
-    """Box filter and float32 RGB, whatever the scene says."""
+def _plain_film(parsed, index):
+    """Box filter and float32 RGB, whatever the scene says; ``index`` is the film's node."""
     import mitsuba as mi
 
+    film = parsed.nodes[index]
     film.props["component_format"] = "float32"
     film.props["pixel_format"] = "rgb"
-    filters = [node for _, node in parsed.children(film) if parsing.is_kind(node, "ReconstructionFilter")]
-    if not filters:
-        node = mi.parser.SceneNode()
-        node.type = mi.ObjectType.ReconstructionFilter
-        node.props.set_plugin_name("box")
-        parsed.state.nodes.append(node)
-        film.props["rfilter"] = mi.Properties.ResolvedReference(len(parsed.nodes) - 1)
+    filters = [n for _, n in parsed.children(film) if parsing.is_kind(n, "ReconstructionFilter")]
     for node in filters:
         for key in list(node.props.keys()):
             del node.props[key]
         node.props.set_plugin_name("box")
+    if not filters:
+        node = mi.parser.SceneNode()
+        node.type = mi.ObjectType.ReconstructionFilter
+        node.props.set_plugin_name("box")
+        film.props["rfilter"] = mi.Properties.ResolvedReference(len(parsed.nodes))
+        # Last: the list may move, and then no node that was taken from it before is valid any longer.
+        parsed.nodes.append(node)
 
 
 def _monte_carlo(scene, spp, seed, with_variance):
@@ -169,6 +170,8 @@ def _monte_carlo(scene, spp, seed, with_variance):
 
     spp = spp or int(scene.sensors()[0].sampler().sample_count())
     integrator = scene.integrator()
+    if integrator is None:
+        raise InputError("the scene has no integrator", field="integrator", expected="such as path")
     settings = {
         "seed": seed,
         "integrator": integrator.class_name() if hasattr(integrator, "class_name") else "",

@@ -1,0 +1,300 @@
+"""Real-time images against noise-free references: gates that pass, and gates that catch injected faults."""
+
+from importlib.resources import files
+
+import numpy as np
+import pytest
+from oracle import oracle_btf
+
+from btfref import registry, representations
+from btfref.compare import compare
+from btfref.errors import InputError
+from btfref.platform import shader_directory
+from btfref.render import gl
+from btfref.render.classes import pixel_classes
+from btfref.render.realtime import realtime
+from btfref.render.reference import render
+from btfref.render.scene import read_scene
+
+GRID = 4
+SIZE = (96, 96)
+GATES = ("image.noise_free", "image.silhouette", "image.background")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _renderers(need):
+    need("llvm")
+    need("gl")
+
+
+def save_fitted(directory, key, **settings):
+    rep = registry.method(key).fit(oracle_btf((32, 32)), **settings)
+    path = directory / f"oracle.{key}.exr"
+    representations.save(rep, path)
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def lpca(tmp_path_factory):
+    return save_fitted(tmp_path_factory.mktemp("lpca"), "lpca", clusters=8, components=4)
+
+
+@pytest.fixture(scope="module")
+def reference(lpca):
+    """``reference(scene, lights) -> (parameters, image, classes)`` of a shipped scene, rendered once."""
+    made = {}
+
+    def get(name, lights):
+        if (name, lights) not in made:
+            path = files("btfref.scenes").joinpath(f"{name}.xml")
+            parameters = {"btf": lpca, "lights": lights, "tiling": "4"}
+            image = render(path, parameters=parameters, noise_free=GRID, shadows=False, size=SIZE)
+            classes = pixel_classes(path, parameters=parameters, grid=GRID, size=SIZE)
+            made[name, lights] = path, parameters, image, classes
+        return made[name, lights]
+
+    return get
+
+
+@pytest.mark.parametrize("lights", ["directional1", "directional3", "points2"])
+@pytest.mark.parametrize("name", ["plane", "sphere", "cloth"])
+def test_shipped_scenes(reference, name, lights):
+    path, parameters, expected, classes = reference(name, lights)
+    image = realtime(path, parameters=parameters, grid=GRID, size=SIZE)
+    comparison = compare(image, expected, classes=classes, gate=GATES, flip=False)
+    assert comparison.passed, [gate.line for gate in comparison.gates if not gate.passed]
+    # The scene fills the picture and is lit: the gates saw something.
+    assert (classes == 1).mean() > 0.2
+    assert (expected.image[classes == 1].max(-1) > 0).mean() > 0.5
+    assert image.meta["not_finite"] == 0
+
+
+FAULTS = {
+    "cosine dropped": ("hosts/mesh.frag", "irradiance * btf", "irradiance / max(w_light.z, 1e-4) * btf"),
+    "light and view swapped": (
+        "hosts/mesh.frag",
+        "btf_eval(uv, w_light, w_view",
+        "btf_eval(uv, w_view, w_light",
+    ),
+    "v flipped": ("hosts/mesh.frag", "btf_eval(uv,", "btf_eval(vec2(uv.x, -uv.y),"),
+    "half-texel shift": ("lib/texels.glsl", "float(columns), 0.5)", "float(columns), 0.0)"),
+    "wrong gamma": ("hosts/mesh.frag", "vec4(scale * sum, 1.0)", "vec4(pow(max(sum, 0.0), vec3(2.2)), 1.0)"),
+    "tangent frame transposed": ("lib/frame.glsl", "return transpose(mat3(", "return (mat3("),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_injected_faults_are_caught_by_the_noise_free_gate(reference, tmp_path, monkeypatch, name):
+    file, right, wrong = FAULTS[name]
+    text = (shader_directory() / file).read_text()
+    assert text.count(right) == 1
+    (tmp_path / file).parent.mkdir(parents=True)
+    (tmp_path / file).write_text(text.replace(right, wrong))
+    shipped = gl.shader_file
+
+    def faulty(rep):
+        shader, directories = shipped(rep)
+        return shader, [tmp_path, *directories]
+
+    monkeypatch.setattr(gl, "shader_file", faulty)
+    path, parameters, expected, classes = reference("cloth", "directional3")
+    image = realtime(path, parameters=parameters, grid=GRID, size=SIZE)
+    comparison = compare(image, expected, classes=classes, gate="image.noise_free", flip=False)
+    failed = {gate.name for gate in comparison.gates if not gate.passed}
+    assert "image.noise_free.p999" in failed
+    # The fault is in what is shown, not in what is seen: the image stays finite.
+    assert "image.finite.nonfinite" not in failed
+
+
+def room(mi, *, shapes, lights, size=SIZE, **more):
+    """A scene dictionary; imports of Mitsuba stay with the caller."""
+    look = mi.ScalarTransform4f().look_at([1.5, -3, 3.2], [0, 0, 0], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": size[0], "height": size[1]}
+    camera = {"type": "perspective", "fov": 38, "to_world": look, "film": film}
+    path = {"type": "path", "max_depth": 2}
+    return {"type": "scene", "integrator": path, "camera": camera, **shapes, **lights, **more}
+
+
+LIGHTS = {
+    "sun": {
+        "type": "directional",
+        "direction": [-0.3, 0.6, -1.0],
+        "irradiance": {"type": "rgb", "value": [3, 2.5, 2]},
+    },
+    "lamp": {"type": "point", "position": [-1.5, 0.5, 0.9], "intensity": {"type": "rgb", "value": [2, 7, 1]}},
+}
+
+
+def test_several_files_texture_transforms_scale_and_both_sides(llvm, tmp_path):
+    """Two shapes with their own files, turned and shifted textures, one seen from behind."""
+    llvm.set_variant("scalar_rgb")
+    transform = llvm.ScalarTransform4f
+    svd, raw = save_fitted(tmp_path, "svd"), save_fitted(tmp_path, "raw")
+    turned = (
+        transform().translate([0.3, -0.2, 0])
+        @ transform().rotate([0, 0, 1], 30)
+        @ transform().scale([3, 2, 1])
+    )
+    front = {"type": "btf", "filename": svd, "to_uv": turned, "scale": 0.7}
+    both = {"type": "twosided", "material": {"type": "btf", "filename": raw, "filter_type": "bilinear"}}
+    away = (
+        transform().translate([0.3, 0.6, 0.8]) @ transform().rotate([1, 0, 0], 120) @ transform().scale(0.5)
+    )
+    shapes = {
+        "floor": {"type": "rectangle", "bsdf": front},
+        "wall": {"type": "rectangle", "to_world": away, "bsdf": both},
+        "box": {
+            "type": "cube",
+            "to_world": transform().translate([-0.6, -0.3, 0.2]).scale(0.2),
+            "bsdf": both,
+        },
+    }
+    scene = room(llvm, shapes=shapes, lights=LIGHTS)
+    described = read_scene(scene)
+    image = realtime(described, grid=GRID)
+    expected = render(scene, noise_free=GRID, shadows=False)
+    comparison = compare(image, expected, classes=pixel_classes(scene, grid=GRID), gate=GATES, flip=False)
+    assert comparison.passed, [gate.line for gate in comparison.gates if not gate.passed]
+
+
+LAMBERT = """// Provides btf_eval of a Lambertian surface.
+// Expects reflectance [1, 4].
+#include "lib/table.glsl"
+uniform sampler2DArray reflectance;
+vec3 btf_eval(vec2 uv, vec3 w_light, vec3 w_view, float lod) {
+    return w_light.z > 0.0 && w_view.z > 0.0 ? table_fetch(reflectance, 0).rgb * w_light.z : vec3(0.0);
+}
+"""
+
+
+class Lambert:
+    """A third party's representation, with a shader of its own."""
+
+    meta = {"method": "lambert", "filter_type": "bilinear"}  # noqa: RUF012 - read only
+
+    def arrays(self):
+        return {"reflectance": np.full((1, 3), 0.5 / np.pi, np.float32)}
+
+    def port_arrays(self):
+        return {"reflectance": np.array([[0.5 / np.pi] * 3 + [0]], np.float32)}
+
+
+@pytest.mark.parametrize("shape", ["rectangle", "cube"])
+@pytest.mark.parametrize("twosided", [False, True])
+def test_lambert_is_mitsubas_diffuse(llvm, tmp_path, monkeypatch, shape, twosided):
+    """End to end without a table: camera, rows, frames, lights. The method is a third party's."""
+    llvm.set_variant("scalar_rgb")
+    package = tmp_path / "lambert_package"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "lambert.glsl").write_text(LAMBERT)
+    monkeypatch.syspath_prepend(tmp_path)
+    row = registry.Method("lambert", "", "", "", "", "lambert.glsl", "lambert_package")
+    monkeypatch.setattr(registry, "method", lambda key, **_: row)
+    monkeypatch.setattr(representations, "load", lambda path: Lambert())
+    (tmp_path / "any.exr").touch()
+
+    def scene(bsdf):
+        bsdf = {"type": "twosided", "inside": bsdf} if twosided else bsdf
+        turned = llvm.ScalarTransform4f().rotate([0, 1, 0], 160 if twosided else 20)
+        return room(llvm, shapes={"shape": {"type": shape, "to_world": turned, "bsdf": bsdf}}, lights=LIGHTS)
+
+    image = realtime(scene({"type": "btf", "filename": str(tmp_path / "any.exr")}), grid=GRID)
+    plain = scene({"type": "diffuse"})
+    expected = render(plain, noise_free=GRID, shadows=False)
+    classes = pixel_classes(plain, grid=GRID)
+    assert (expected.image[classes == 1].max(-1) > 0).any()
+    comparison = compare(
+        image, expected, classes=classes, gate=("image.lambert", "image.background"), flip=False
+    )
+    assert comparison.passed, [gate.line for gate in comparison.gates if not gate.passed]
+
+
+def test_shadows_can_be_left_out(llvm):
+    """With shadows the reference is never brighter, and darker somewhere; path tracing agrees with it."""
+    llvm.set_variant("scalar_rgb")
+    transform = llvm.ScalarTransform4f
+    shapes = {
+        "floor": {"type": "rectangle", "bsdf": {"type": "diffuse"}},
+        "ball": {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.3, "bsdf": {"type": "diffuse"}},
+        "flat": {"type": "rectangle", "to_world": transform().translate([0, 0, 0.9]).scale(0.2)},
+    }
+    scene = room(llvm, shapes=shapes, lights=LIGHTS, size=(48, 48))
+    lit = render(scene, noise_free=2, shadows=False).image
+    shadowed = render(scene, noise_free=2).image
+    assert (shadowed <= lit).all()
+    assert (shadowed < 0.9 * lit).mean() > 0.02
+    traced = render(scene, spp=256, seed=3, with_variance=True)
+    comparison = compare(traced, render(scene, noise_free=16), gate="image.difference", flip=False)
+    assert comparison.passed, [gate.line for gate in comparison.gates if not gate.passed]
+
+
+def test_same_seed_same_image(llvm):
+    llvm.set_variant("scalar_rgb")
+    scene = room(llvm, shapes={"a": {"type": "sphere"}}, lights=LIGHTS, size=(16, 16))
+    first, second, other = (render(scene, spp=4, seed=seed).image for seed in (1, 1, 2))
+    assert (first == second).all()
+    assert (first != other).any()
+    assert llvm.variant() == "scalar_rgb"
+
+
+def test_a_silhouette_is_where_surfaces_meet_the_background(llvm):
+    llvm.set_variant("scalar_rgb")
+    scene = room(llvm, shapes={"a": {"type": "sphere"}}, lights=LIGHTS, size=(64, 64))
+    classes = pixel_classes(scene, grid=2)
+    assert classes[32, 32] == 1
+    assert classes[0, 0] == 0
+    ring = classes == 2
+    # A closed ring: no interior pixel touches the background.
+    for axis in (0, 1):
+        for step in (1, -1):
+            assert not ((classes == 1) & (np.roll(classes, step, axis) == 0)).any()
+    assert 0.02 < ring.mean() < 0.3
+
+
+def test_a_fold_in_front_of_the_surface_is_a_silhouette(llvm, tmp_path):
+    """One mesh, two sheets: no other shape and no background beside the edge."""
+    llvm.set_variant("scalar_rgb")
+    sheets = np.array(
+        [
+            [-9, -9, 0],
+            [9, -9, 0],
+            [9, 9, 0],
+            [-9, 9, 0],
+            [-9, -9, 0.3],
+            [0, -9, 0.3],
+            [0, 9, 0.3],
+            [-9, 9, 0.3],
+        ]
+    )
+    import trimesh
+
+    faces = [[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]
+    trimesh.Trimesh(sheets, faces, process=False).export(tmp_path / "sheets.ply")
+    shape = {"type": "ply", "filename": str(tmp_path / "sheets.ply")}
+    classes = pixel_classes(room(llvm, shapes={"a": shape}, lights=LIGHTS, size=(64, 64)), grid=2)
+    assert 0.01 < (classes == 2).mean() < 0.15
+    assert (classes == 0).sum() == 0
+
+
+def test_realtime_refuses_what_it_cannot_show(llvm):
+    llvm.set_variant("scalar_rgb")
+    sphere = {"a": {"type": "sphere", "bsdf": {"type": "conductor"}}}
+    with pytest.raises(InputError, match="light"):
+        realtime(room(llvm, shapes={}, lights={}))
+    with pytest.raises(InputError, match="conductor"):
+        realtime(room(llvm, shapes=sphere, lights=LIGHTS))
+    with pytest.raises(InputError, match="grid"):
+        realtime(room(llvm, shapes={}, lights=LIGHTS), grid=0)
+    with pytest.raises(InputError, match="delta"):
+        render(room(llvm, shapes=sphere, lights={"sky": {"type": "constant"}}), noise_free=1)
+    bare = room(llvm, shapes=sphere, lights=LIGHTS)
+    del bare["integrator"]
+    with pytest.raises(InputError, match="integrator"):
+        render(bare, spp=1)
+    with pytest.raises(InputError, match="shadows"):
+        render(room(llvm, shapes=sphere, lights=LIGHTS), shadows=False)
+    with pytest.raises(InputError, match="variant"):
+        render(room(llvm, shapes=sphere, lights=LIGHTS), variant="scalar_float")
+    with pytest.raises(InputError, match="JIT"):
+        render(room(llvm, shapes=sphere, lights=LIGHTS), variant="scalar_rgb", noise_free=1)
