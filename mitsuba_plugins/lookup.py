@@ -20,6 +20,11 @@ HALF_LIMIT = 65504 / HALF_SHIFT
 HALF_SCALE = 2.0**112 / HALF_SHIFT
 
 
+#: Entries up to this many values are blended in straight-line code; wider ones loop over views, since the time to
+#: compile a kernel grows faster than its length.
+UNROLLED_WIDTH = 16
+
+
 def valid_directions(w):
     """As :func:`btfref.conventions.valid_directions`."""
     return (w.z > 0) & (dr.squared_norm(w) < 4)
@@ -273,48 +278,63 @@ class PairTable:
         # The plain copy is only needed for gradients.
         self.values = None
 
-    def blend(self, outer, views, lights, active=True):
-        """Interpolate over views and lights.
+    def combine(self, outer, views, lights, coefficients, active=True):
+        """Interpolate over views and lights, and combine the colours of an entry linearly.
 
         Parameters
         ----------
         outer : UInt32
             Index of the outermost axis.
         views, lights : list of Neighbour
+        coefficients : list of Float
+            One for each colour of an entry (three values each); fewer than the entry holds ignore the rest.
         active : Bool
 
         Returns
         -------
-        list of Float
-            ``width`` values.
+        Color3f
+            ``Σ_pairs weight Σ_j coefficient_j colour_j``.
         """
-        total = [mi.Float(0)] * self.width
-        for neighbour in views:
-            for view, view_weight in neighbour.single():
-                base = (outer * self.n_views + view) * self.n_lights
-                for light in lights:
-                    if self.words is not None and self.following is not None:
-                        self._add_pair(total, base + light.index, view_weight, light, active)
-                    else:
-                        for index, weight in light.single():
-                            self._add_single(total, base + index, view_weight * weight, active)
+        if self.words is not None:
+            # Applied first: unscaled halves times small weights would underflow.
+            coefficients = [c * HALF_SCALE for c in coefficients]
+        outer = outer * self.n_views
+        pairs = [pair for neighbour in views for pair in neighbour.single()]
+        if self.words is None or self.width <= UNROLLED_WIDTH:
+            total = mi.Color3f(0)
+            for view, weight in pairs:
+                total = self._add_view(total, outer + view, weight, lights, coefficients, active)
+            return total
+
+        def body(step, total):
+            view, weight = pairs[0]
+            for i, (other, other_weight) in enumerate(pairs[1:], 1):
+                view, weight = dr.select(step == i, other, view), dr.select(step == i, other_weight, weight)
+            return step + 1, self._add_view(total, outer + view, weight, lights, coefficients, active)
+
+        return dr.while_loop(
+            (mi.UInt32(0), mi.Color3f(0)), lambda step, total: step < len(pairs), body, label="views"
+        )[1]
+
+    def _add_view(self, total, view, weight, lights, coefficients, active):
+        """``total`` plus the contribution of one view, interpolated over lights."""
+        base = view * self.n_lights
+        for light in lights:
+            if self.words is not None and self.following is not None:
+                words = read_packets(self.words, base + light.index, self.width, active)
+                halves = [widened(word) for word in words[: 3 * len(coefficients)]]
+                total = _add(total, [low for low, _ in halves], coefficients, weight * light.weight)
+                total = _add(total, [high for _, high in halves], coefficients, weight * light.following_weight)
+                continue
+            for index, light_weight in light.single():
+                total = _add(total, self._values(base + index, active), coefficients, weight * light_weight)
         return total
 
-    def _add_pair(self, total, entry, view_weight, light, active):
-        low_weight = view_weight * light.weight * HALF_SCALE
-        high_weight = view_weight * light.following_weight * HALF_SCALE
-        for k, word in enumerate(read_packets(self.words, entry, self.width, active)):
-            low, high = widened(word)
-            total[k] = dr.fma(high, high_weight, dr.fma(low, low_weight, total[k]))
-
-    def _add_single(self, total, entry, weight, active):
-        if self.words is not None:
-            weight = weight * HALF_SCALE
-            values = [v for word in read_packets(self.words, entry, self.width // 2, active) for v in widened(word)]
-        else:
-            values = read_packets(self.values, entry, self.width, active)
-        for k, value in enumerate(values):
-            total[k] = dr.fma(mi.Float(value), weight, total[k])
+    def _values(self, entry, active):
+        """The values of an entry one by one, not yet multiplied by ``HALF_SCALE``."""
+        if self.words is None:
+            return [mi.Float(value) for value in read_packets(self.values, entry, self.width, active)]
+        return [half for word in read_packets(self.words, entry, self.width // 2, active) for half in widened(word)]
 
 
 def widened(word):
@@ -323,6 +343,17 @@ def widened(word):
     low = dr.reinterpret_array(mi.Float, ((word << 13) & 0x0FFFE000) | ((word << 16) & 0x80000000))
     high = dr.reinterpret_array(mi.Float, ((word >> 3) & 0x0FFFE000) | (word & 0x80000000))
     return low, high
+
+
+def _add(total, values, coefficients, weight):
+    """``total + weight Σ_j coefficient_j colour_j``: few live registers, whatever the number of coefficients."""
+    result = []
+    for channel in range(3):
+        value = values[channel] * coefficients[0]
+        for j, coefficient in enumerate(coefficients[1:], 1):
+            value = dr.fma(values[3 * j + channel], coefficient, value)
+        result.append(dr.fma(value, weight, total[channel]))
+    return mi.Color3f(*result)
 
 
 def read_packets(array, entry, width, active=True):

@@ -20,6 +20,7 @@ class Evaluator:
     def update(self, maps):
         """Take over changed maps."""
         weights = maps.tensors["weights"]
+        self.differentiable = dr.grad_enabled(weights) or dr.grad_enabled(maps.tensors["basis"])
         self.basis = PairTable(maps.tensors["basis"], self.lights.following())
         self.weights, self.width = weights.array, weights.shape[-1]
         # Padding of the index map served the shader's texels only.
@@ -32,13 +33,6 @@ class Evaluator:
         weights = read_packets(self.weights, texel, self.width, active)[: self.n_components]
         return cluster, [mi.Float(share), *(mi.Float(w) * share for w in weights)]
 
-    def _combine(self, cluster, coefficient, views, lights, active):
-        table = self.basis.blend(cluster, views, lights, active)
-        total = mi.Color3f(0)
-        for k, c in enumerate(coefficient):
-            total = dr.fma(mi.Color3f(table[3 * k : 3 * k + 3]), c, total)
-        return total
-
     def evaluate(self, uv, w_light, w_view, active):
         """B in 1/sr for valid directions; may be slightly negative."""
         views, lights = self.views.stencil(w_view), self.lights.stencil(w_light, hold=False)
@@ -46,7 +40,46 @@ class Evaluator:
             self._texel(texel, share, active)
             for texel, share in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True)
         ]
-        total = mi.Color3f(0)
-        for cluster, coefficient in texels:
-            total += self._combine(cluster, coefficient, views, lights, active)
+        if len(texels) == 1:
+            (cluster, coefficient), = texels
+            return self.basis.combine(cluster, views, lights, coefficient, active)
+        if self.differentiable:
+            # Gradients do not reach variables that a loop captures.
+            parts = [self.basis.combine(cluster, views, lights, c, active) for cluster, c in texels]
+            return sum(parts[1:], parts[0])
+        return self._combine_distinct(texels, views, lights, active)
+
+    def _combine_distinct(self, texels, views, lights, active):
+        """Sum over texels, with one table lookup per distinct cluster: neighbours mostly share theirs."""
+        clusters = [cluster for cluster, _ in texels]
+        # Each texel's coefficients join those of the first texel of the same cluster.
+        owners = []
+        for i, cluster in enumerate(clusters):
+            owner = mi.UInt32(i)
+            for j in reversed(range(i)):
+                owner = dr.select(cluster == clusters[j], j, owner)
+            owners.append(owner)
+        merged = [
+            [sum(dr.select(owners[j] == i, texels[j][1][k], 0) for j in range(i, len(texels))) for k in range(len(c))]
+            for i, (_, c) in enumerate(texels)
+        ]
+        # The owners in use move to the front, so that the loop below ends after the last of them.
+        rank = [mi.UInt32(0)]
+        for i in range(1, len(texels)):
+            rank.append(rank[-1] + dr.select(owners[i - 1] == i - 1, mi.UInt32(1), 0))
+        n_distinct = rank[-1] + dr.select(owners[-1] == len(texels) - 1, mi.UInt32(1), 0)
+
+        def body(step, total, *_):
+            cluster, coefficient = clusters[0], merged[0]
+            for i in range(1, len(texels)):
+                here = (rank[i] == step) & (owners[i] == i)
+                cluster = dr.select(here, clusters[i], cluster)
+                coefficient = [dr.select(here, a, b) for a, b in zip(merged[i], coefficient, strict=True)]
+            here = active & (step < n_distinct)
+            total = total + self.basis.combine(cluster, views, lights, coefficient, here)
+            return step + 1, total
+
+        _, total = dr.while_loop(
+            (mi.UInt32(0), mi.Color3f(0)), lambda step, total: active & (step < n_distinct), body, label="lpca"
+        )
         return total

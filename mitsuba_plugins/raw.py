@@ -27,6 +27,5 @@ class Evaluator:
         views, lights = self.views.stencil(w_view), self.lights.stencil(w_light, hold=False)
         total = mi.Color3f(0)
         for texel, weight in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True):
-            value = self.values.blend(texel, views, lights, active)
-            total += mi.Color3f(value[:3]) * weight
+            total += self.values.combine(texel, views, lights, [weight], active)
         return total

@@ -29,10 +29,10 @@ class Evaluator:
         for texel, share in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True):
             for k, value in enumerate(read_packets(self.weights, texel, self.width, active)):
                 coefficient[k] = dr.fma(mi.Float(value), share, coefficient[k])
-        table = self.basis.blend(
-            mi.UInt32(0), self.views.stencil(w_view), self.lights.stencil(w_light, hold=False), active
+        return self.basis.combine(
+            mi.UInt32(0),
+            self.views.stencil(w_view),
+            self.lights.stencil(w_light, hold=False),
+            coefficient[: self.n_components],
+            active,
         )
-        total = mi.Color3f(0)
-        for k in range(self.n_components):
-            total = dr.fma(mi.Color3f(table[3 * k : 3 * k + 3]), coefficient[k], total)
-        return total
