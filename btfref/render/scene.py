@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 
 import numpy as np
 
-from btfref.errors import InputError
+from btfref.errors import InputError, MissingDependencyError
+from btfref.platform import prepare_llvm
 from btfref.render import parsing
 from btfref.render.shapes import BtfMaterial, MeshDescription, triangles_of
 
 __all__ = ["BtfMaterial", "Camera", "Light", "MeshDescription", "SceneDescription", "read_scene"]
 
-#: Reading scenes loads no LLVM: this variant is compiled ahead of time.
+#: Reading scenes needs no LLVM: this variant is compiled ahead of time.
 VARIANT = "scalar_rgb"
 
 LIGHTS = ("directional", "point")
@@ -130,6 +132,10 @@ def read_scene(scene, parameters=None, *, size=None):
         not ``perspective`` or is cropped, a light or shape of an unsupported kind, a shape without texture
         coordinates, a missing BTF file.
     """
+    # Importing Mitsuba loads some LLVM, whatever the variant: where there is a good one, it shall be that. Reading
+    # itself needs none.
+    with contextlib.suppress(MissingDependencyError):
+        prepare_llvm()
     import mitsuba as mi
 
     before = mi.variant()

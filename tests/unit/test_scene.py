@@ -1,4 +1,4 @@
-"""Scenes are read as Mitsuba reads them, and bad ones are refused in one line. No LLVM is loaded."""
+"""Scenes are read as Mitsuba reads them, and bad ones are refused in one line. No LLVM is needed."""
 
 import numpy as np
 import pytest
