@@ -132,8 +132,8 @@ def read_scene(scene, parameters=None, *, size=None):
         not ``perspective`` or is cropped, a light or shape of an unsupported kind, a shape without texture
         coordinates, a missing BTF file.
     """
-    # Importing Mitsuba loads some LLVM, whatever the variant: where there is a good one, it shall be that. Reading
-    # itself needs none.
+    # Importing Mitsuba loads some LLVM, whatever the variant: where there is a good one, it shall be that.
+    # Reading itself needs none.
     with contextlib.suppress(MissingDependencyError):
         prepare_llvm()
     import mitsuba as mi
