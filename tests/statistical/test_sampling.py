@@ -1,0 +1,175 @@
+"""Importance sampling of the plugin: density, weights, and what it gains over cosine sampling; for every method."""
+
+import numpy as np
+import pytest
+from oracle import oracle_btf
+
+from btfref.compare.tolerances import tolerance
+from btfref.registry import methods
+from btfref.representations import save
+
+UVS = ((0.1, 0.2), (0.72, 0.35), (0.5, 0.5), (0.3, 0.8), (0.9, 0.93))
+VIEWS = {"normal": (0, 0, 1), "oblique": (0.6, 0.2, 0.7), "grazing": (0.9, -0.3, 0.02)}
+SAMPLES = 1_000_000
+
+
+@pytest.fixture(scope="module")
+def paths(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sampling")
+    result = {}
+    for kind, views in (("ubo81", "ubo81"), ("10x5", "10x5")):
+        btf = oracle_btf((24, 20), views, views)
+        for key, row in methods().items():
+            result[key, kind] = folder / f"{kind}.{key}.exr"
+            save(row.fit(btf), result[key, kind])
+    return result
+
+
+@pytest.fixture(params=[(key, "ubo81") for key in methods()] + [("lpca", "10x5")], ids="-".join)
+def path(request, paths):
+    return paths[request.param]
+
+
+def load(mi, path, **parameters):
+    import mitsuba_plugins
+
+    mitsuba_plugins.register()
+    return mi.load_dict({"type": "btf", "filename": str(path), **parameters})
+
+
+def interaction(mi, n, uv, w_view):
+    import drjit as dr
+
+    si = dr.zeros(mi.SurfaceInteraction3f, n)
+    si.uv, si.wi = mi.Point2f(uv), mi.Vector3f(w_view)
+    return si
+
+
+def unit(w):
+    return np.array(w, float) / np.linalg.norm(w)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_samples_follow_the_density(path, view, llvm, tmp_path, monkeypatch):
+    """χ² of a million samples; significance Šidák-corrected over all tests of this function."""
+    import drjit as dr
+
+    # On failure the test class writes its tables into the working directory.
+    monkeypatch.chdir(tmp_path)
+    mi = llvm
+    bsdf, context = load(mi, path), mi.BSDFContext()
+    w_view = unit(VIEWS[view])
+    for uv in UVS:
+
+        def sample(s, uv=uv):
+            bs, _ = bsdf.sample(context, interaction(mi, dr.width(s), uv, w_view), s[0], mi.Point2f(s[1], s[2]))
+            return bs.wo, dr.select(bs.pdf > 0, mi.Float(1), 0)
+
+        def pdf(w, uv=uv):
+            return bsdf.pdf(context, interaction(mi, dr.width(w), uv, w_view), w)
+
+        test = mi.chi2.ChiSquareTest(
+            domain=mi.chi2.SphericalDomain(), sample_func=sample, pdf_func=pdf, sample_dim=3, sample_count=SAMPLES, ires=16
+        )
+        n_tests = len(VIEWS) * len(UVS) * (len(methods()) + 1)
+        assert test.run(tolerance("chi2.significance"), test_count=n_tests, quiet=True), test.messages
+
+
+def grid(n_theta=192, n_phi=384):
+    """Midpoint rule in (sin² θ, φ): directions and solid angles; cell borders of the guide fall between nodes."""
+    u = (np.arange(n_theta) + 0.5) / n_theta
+    phi = (np.arange(n_phi) + 0.5) / n_phi * 2 * np.pi
+    u, phi = (a.ravel() for a in np.meshgrid(u, phi, indexing="ij"))
+    z = np.sqrt(1 - u)
+    w = np.stack([np.sqrt(u) * np.cos(phi), np.sqrt(u) * np.sin(phi), z], -1)
+    return w, np.pi / (n_theta * n_phi) / z
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_density_integrates_to_one(path, view, llvm):
+    mi = llvm
+    bsdf = load(mi, path)
+    w, solid_angle = grid()
+    for uv in UVS:
+        pdf = np.array(bsdf.pdf(mi.BSDFContext(), interaction(mi, len(w), uv, unit(VIEWS[view])), mi.Vector3f(w.T)))
+        assert abs(pdf @ solid_angle - 1) <= tolerance("pdf.integral.max")
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_weight_is_value_over_density(path, view, llvm, rng):
+    """sample() returns eval/pdf and its own pdf(); eval_pdf() is the pair of both."""
+    mi = llvm
+    bsdf, context, n = load(mi, path), mi.BSDFContext(), 1 << 16
+    for uv in UVS:
+        si = interaction(mi, n, uv, unit(VIEWS[view]))
+        bs, weight = bsdf.sample(context, si, mi.Float(rng.random(n)), mi.Point2f(rng.random((2, n))))
+        value, pdf = bsdf.eval(context, si, bs.wo), np.array(bsdf.pdf(context, si, bs.wo))
+        both = bsdf.eval_pdf(context, si, bs.wo)
+        value, weight = np.array(value), np.array(weight)
+        scale = np.abs(value).max()
+        assert (pdf > 0).all()
+        assert (np.abs(np.array(bs.pdf) - pdf) <= tolerance("sample.pdf.max") * pdf).all()
+        assert (np.abs(weight * pdf - value) <= tolerance("sample.weight.max") * np.maximum(np.abs(value), 1e-3 * scale)).all()
+        np.testing.assert_array_equal(np.array(both[0]), value)
+        np.testing.assert_array_equal(np.array(both[1]), pdf)
+        assert (np.array(bs.wo)[2] > 0).all()
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_variance_is_at_most_that_of_cosine_sampling(path, view, llvm):
+    """Exact by quadrature: constant environment, and a bright spot where the material reflects most."""
+    mi = llvm
+    context = mi.BSDFContext()
+    guided, cosine = load(mi, path), load(mi, path, sampling="cosine")
+    w, solid_angle = grid()
+    ratios = {"constant": [], "spot": []}
+    for uv in UVS:
+        si = interaction(mi, len(w), uv, unit(VIEWS[view]))
+        value = np.array(guided.eval(context, si, mi.Vector3f(w.T))).mean(0)
+        density = {b: np.array(b.pdf(context, si, mi.Vector3f(w.T))) for b in (guided, cosine)}
+        np.testing.assert_allclose(density[cosine], w[:, 2] / np.pi, rtol=1e-5)
+        lobe = w[np.argmax(density[guided] / density[cosine])]
+        lights = {"constant": np.ones(len(w)), "spot": 0.1 + 100 * np.exp(100 * (w @ lobe - 1))}
+        for name, radiance in lights.items():
+            variance = [
+                ((value * radiance) ** 2 / density[b]) @ solid_angle - ((value * radiance) @ solid_angle) ** 2
+                for b in (guided, cosine)
+            ]
+            ratios[name].append(variance[0] / variance[1])
+    for name, values in ratios.items():
+        assert max(values) <= tolerance("sample.variance_ratio.max"), f"{name}: {values}"
+
+
+def test_lambertian_is_sampled_as_by_cosine(llvm, tmp_path):
+    """A constant B / cos θ leaves the cells equal: the densities are the same but for interpolation of the cosine."""
+    from dataclasses import replace
+
+    mi = llvm
+    btf = oracle_btf((4, 4))
+    values = np.broadcast_to(btf.lights.vectors[None, :, None, None, 2:] / np.pi, btf.values.shape)
+    save(methods()["raw"].fit(replace(btf, values=values.astype(np.float16))), tmp_path / "flat.raw.exr")
+    bsdf = load(mi, tmp_path / "flat.raw.exr")
+    w, _ = grid(32, 64)
+    pdf = np.array(bsdf.pdf(mi.BSDFContext(), interaction(mi, len(w), (0.4, 0.4), unit((0.3, 0.1, 0.9))), mi.Vector3f(w.T)))
+    np.testing.assert_allclose(pdf, w[:, 2] / np.pi, rtol=tolerance("sample.lambert.max"))
+
+
+def test_a_wrong_density_is_caught(paths, llvm, tmp_path, monkeypatch):
+    """The χ² test rejects samples of one view against the density of another."""
+    import drjit as dr
+
+    monkeypatch.chdir(tmp_path)
+    mi = llvm
+    bsdf, context = load(mi, paths["lpca", "ubo81"]), mi.BSDFContext()
+    test = mi.chi2.ChiSquareTest(
+        domain=mi.chi2.SphericalDomain(),
+        sample_func=lambda s: (
+            bsdf.sample(context, interaction(mi, dr.width(s), UVS[0], unit((0, 0, 1))), s[0], mi.Point2f(s[1], s[2]))[0].wo,
+            mi.Float(1),
+        ),
+        pdf_func=lambda w: bsdf.pdf(context, interaction(mi, dr.width(w), UVS[0], unit((0.3, 0, 1))), w),
+        sample_dim=3,
+        sample_count=SAMPLES,
+        ires=16,
+    )
+    assert not test.run(tolerance("chi2.significance"), quiet=True)
