@@ -20,7 +20,7 @@ N_CELLS = N_RADIAL * N_AZIMUTH
 
 #: Share of pure cosine sampling: bounds the weight of a sample by 1 / share times that of cosine sampling, for texels
 #: that differ from their group's mean.
-COSINE_SHARE = 0.3
+COSINE_SHARE = 0.4
 
 #: Points per side of a cell over which B / cos θ is averaged.
 _SUBSAMPLES = 4

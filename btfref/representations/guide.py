@@ -6,8 +6,9 @@ import numpy as np
 
 from btfref.numerics.clustering import lloyd
 
-#: Groups of a texture. More cost memory and bring little: the tables are only a guide.
-N_GROUPS = 16
+#: Groups of a texture. On the checker 16 leave a variance of 0.41 times that of cosine sampling in a constant
+#: environment (median over texels and views), 64 leave 0.22, 256 leave 0.15 for four times the memory.
+N_GROUPS = 64
 
 #: Views whose light tables tell texels apart.
 N_FEATURE_VIEWS = 7

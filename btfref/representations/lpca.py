@@ -15,6 +15,7 @@ import numpy as np
 from btfref import conventions
 from btfref.numerics.clustering import local_pca
 from btfref.numerics.lowrank import principal_rows, range_basis, texel_matrix
+from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
     base_meta,
     direction_arrays,
@@ -76,8 +77,18 @@ class Representation:
         return packed_arrays(self.maps, basis=basis.reshape(*basis.shape[:3], -1))
 
     def sampling_tables(self):
-        """One group per cluster: its mean."""
-        return self.maps["cluster"][..., 0], conventions.luminance(self.maps["basis"][:, 0].astype(float))
+        """Groups of texels alike, and their means."""
+        basis = conventions.luminance(self.maps["basis"].astype(np.float32))
+        cluster = self.maps["cluster"].reshape(-1)
+        weights = self.maps["weights"].reshape(len(cluster), -1).astype(np.float32)
+        n_clusters, n_colours = basis.shape[:2]
+        # Coefficients over all clusters' colours, zero outside of the texel's own.
+        coefficient = np.zeros((len(cluster), n_clusters, n_colours), np.float32)
+        coefficient[np.arange(len(cluster)), cluster] = np.concatenate([np.ones((len(cluster), 1)), weights], 1)
+        some = basis[:, :, feature_views(basis.shape[2])].reshape(n_clusters * n_colours, -1)
+        labels = texel_groups(coefficient.reshape(len(cluster), -1) @ some)
+        mean = np.tensordot(group_means(labels, coefficient), basis, 2)
+        return labels.reshape(self.maps["cluster"].shape[:2]), mean
 
     @classmethod
     def from_arrays(cls, arrays, meta):
