@@ -16,6 +16,14 @@ CLASSES = ("background", "interior", "silhouette")
 #: which is far less; a fold in front of another surface leaves it by their distance.
 STEP = 0.25
 
+#: Distance in pixels, along each axis, within which a rasterizer may give a sample to the next triangle:
+#: vertices are rounded to multiples of 1/256 pixel (Direct3D 11.3 functional specification, 3.4.1; GPUs and
+#: llvmpipe follow it).
+SNAP = 0.5 / 256
+
+#: Turn of the tangent frame, in radians, below which the neighbouring triangle shows the same value.
+TURN = 1e-4
+
 
 def pixel_classes(scene, *, parameters=None, size=None, grid=4, variant="llvm_ad_rgb"):
     """Class of every pixel, from the primary hits of a regular sub-pixel grid.
@@ -23,8 +31,9 @@ def pixel_classes(scene, *, parameters=None, size=None, grid=4, variant="llvm_ad
     A pixel is *silhouette* when samples of it or of its eight neighbours mix hit and miss or several shapes,
     when the surface jumps in depth between two of them (a fold in front of the cloth itself), or when the
     view passes the horizon of the shading normal, where B jumps to zero. There, two renderers may see
-    different surfaces at the same sample: rasterizers snap vertices to 1/256 pixel. All other pixels that are
-    hit are *interior*.
+    different surfaces at the same sample: rasterizers snap vertices to 1/256 pixel. Hence a pixel is
+    silhouette, too, when one of its samples lies that close to an edge between triangles whose tangent frames
+    differ: ∂p/∂u is constant on a triangle, so B jumps there. All other pixels that are hit are *interior*.
 
     Parameters
     ----------
@@ -43,7 +52,7 @@ def pixel_classes(scene, *, parameters=None, size=None, grid=4, variant="llvm_ad
         0 background, 1 interior, 2 silhouette.
     """
     with loaded(scene, parameters, variant=variant, size=size) as made:
-        shape, point, normal, front, footprint = _hits(made, grid)
+        shape, point, normal, front, footprint, ambiguous = _hits(made, grid)
     hit = shape > 0
     edge = np.zeros(shape.shape, bool)
     for axis in (0, 1):
@@ -56,7 +65,7 @@ def pixel_classes(scene, *, parameters=None, size=None, grid=4, variant="llvm_ad
         edge[a] |= differs
         edge[b] |= differs
     pixels = (shape.shape[0] // grid, grid, shape.shape[1] // grid, grid)
-    any_edge = _spread(edge.reshape(pixels).any((1, 3)))
+    any_edge = _spread(edge.reshape(pixels).any((1, 3))) | ambiguous.reshape(pixels).any((1, 3))
     any_hit = hit.reshape(pixels).any((1, 3))
     return np.where(any_edge, SILHOUETTE, np.where(any_hit, INTERIOR, BACKGROUND)).astype(np.uint8)
 
@@ -87,6 +96,8 @@ def _hits(scene, grid):
         Side of the shading normal that is seen.
     footprint : ndarray of float32
         Size of a pixel at the hit.
+    ambiguous : ndarray of bool
+        Within `SNAP` of a triangle with another tangent frame.
     """
     import drjit as dr
     import mitsuba as mi
@@ -100,6 +111,7 @@ def _hits(scene, grid):
         "normal": np.zeros((*fine, 3), np.float32),
         "front": np.zeros(fine, bool),
         "footprint": np.zeros(fine, np.float32),
+        "ambiguous": np.zeros(fine, bool),
     }
     offsets = grid_offsets(grid)
     for number, offset in enumerate(offsets):
@@ -107,12 +119,18 @@ def _hits(scene, grid):
         beside, _ = film_rays(sensor, (offset[0] + 1, offset[1]))
         si = scene.ray_intersect(ray)
         hit = si.is_valid()
+        ambiguous = dr.zeros(mi.Bool, dr.width(ray))
+        for x, y in ((-SNAP, -SNAP), (SNAP, -SNAP), (-SNAP, SNAP), (SNAP, SNAP)):
+            moved = scene.ray_intersect(film_rays(sensor, (offset[0] + x, offset[1] + y))[0], hit)
+            other = (moved.prim_index != si.prim_index) & moved.is_valid()
+            ambiguous |= other & (dr.norm(moved.sh_frame.s - si.sh_frame.s) > TURN)
         values = {
             "shape": dr.select(hit, dr.reinterpret_array(mi.UInt32, si.shape), 0),
             "point": dr.select(hit, si.p, 0),
             "normal": dr.select(hit, si.n, 0),
             "front": si.wi.z > 0,
             "footprint": dr.select(hit, si.t * dr.norm(ray.d - beside.d), 0),
+            "ambiguous": ambiguous,
         }
         dr.eval(values)
         j, i = divmod(number, grid)

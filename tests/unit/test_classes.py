@@ -1,0 +1,46 @@
+"""Pixel classes at edges between triangles of one smooth surface."""
+
+import numpy as np
+import pytest
+
+from btfref.render.classes import INTERIOR, SILHOUETTE, pixel_classes
+
+#: A square in two triangles, larger than the picture; its diagonal runs through the picture's corners.
+CORNERS = ((-2, -2), (2, -2), (2, 2), (-2, 2))
+
+
+def write_square(path, uv):
+    vertices = "\n".join(f"{x} {y} 0 {u} {v}" for (x, y), (u, v) in zip(CORNERS, uv, strict=True))
+    names = "\n".join(f"property float {name}" for name in ("x", "y", "z", "u", "v"))
+    path.write_text(
+        f"ply\nformat ascii 1.0\nelement vertex 4\n{names}\nelement face 2\n"
+        f"property list uchar int vertex_indices\nend_header\n{vertices}\n3 0 1 2\n3 0 2 3\n"
+    )
+
+
+def classes_of(mi, path, size=16):
+    view = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": size, "height": size}
+    scene = {
+        "type": "scene",
+        "sensor": {"type": "perspective", "fov": 30, "to_world": view, "film": film},
+        "square": {"type": "ply", "filename": str(path)},
+        "light": {"type": "point", "position": [0, 0, 3]},
+    }
+    return pixel_classes(scene, grid=2)
+
+
+@pytest.mark.parametrize(
+    ("fourth", "turned"),
+    [((0, 1), False), ((0, 0.5), True)],
+    ids=["one tangent frame", "two tangent frames"],
+)
+def test_samples_on_an_edge_between_tangent_frames_are_ambiguous(fourth, turned, llvm, tmp_path):
+    """Rationale: ∂p/∂u is constant on a triangle, and a rasterizer may give such a sample to either."""
+    llvm.set_variant("scalar_rgb")
+    write_square(tmp_path / "square.ply", [(0, 0), (1, 0), (1, 1), fourth])
+    classes = classes_of(llvm, tmp_path / "square.ply")
+    # World x and y run to the left and up, so that the diagonal y = x falls from left to right.
+    diagonal = np.eye(16, dtype=bool)[:, ::-1] if classes[0, -1] == SILHOUETTE else np.eye(16, dtype=bool)
+    assert (classes[~diagonal] == INTERIOR).all()
+    assert (classes[diagonal] == (SILHOUETTE if turned else INTERIOR)).all()
