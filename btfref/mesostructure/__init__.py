@@ -22,6 +22,8 @@ __all__ = ["MESOSTRUCTURES", "Mesostructure", "Part", "build", "names"]
 MESOSTRUCTURES = {
     "checker": "btfref.mesostructure.checker:checker",
     "flat": "btfref.mesostructure.flat:flat",
+    "rings": "btfref.mesostructure.rings:rings",
+    "tissue": "btfref.mesostructure.tissue:tissue",
 }
 
 ENTRY_POINT_GROUP = "btfref.mesostructures"

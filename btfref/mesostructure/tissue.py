@@ -1,0 +1,165 @@
+"""A plain weave: warp and weft yarns that cross over and under each other.
+
+After the tissue of Suykens, vom Berge, Lagae, Dutré, *Interactive rendering with bidirectional texture
+functions* (Eurographics 2003); its dimensions are not given there, those here are our own.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from btfref.errors import InputError
+from btfref.mesostructure.base import Mesostructure, Part
+from btfref.mesostructure.checks import colour, number, sweep_faces, whole
+
+#: Smallest clearance between two yarns, in half thicknesses: far above what facets take off.
+_CLEARANCE = 0.02
+
+
+def tissue(
+    *,
+    count=4,
+    width=0.8,
+    thickness=0.08,
+    amplitude=0.05,
+    segments=96,
+    sides=20,
+    warp_colour=(0.62, 0.10, 0.08),
+    weft_colour=(0.75, 0.62, 0.40),
+    roughness=0.45,
+    anisotropy=0.7,
+    sheen=0.6,
+    backing_colour=(0.03, 0.03, 0.035),
+):
+    """Warp along x, weft along y, each an elliptic tube whose axis follows a cosine.
+
+    With pitch p = 1/count, half width w and half thickness t, warp and weft are apart where
+    ``A (cos(πξ/p) + cos(πη/p)) > t (√(1 − ξ²/w²) + √(1 − η²/w²))`` on the whole crossing |ξ|, |η| ≤ w; each
+    term is checked on its own, which suffices.
+
+    Parameters
+    ----------
+    count : int
+        Yarns of each kind in the tile, even.
+    width : float
+        Width of a yarn as a share of the pitch, (0, 0.95].
+    thickness : float
+        Thickness of a yarn in tile units.
+    amplitude : float
+        A, height of the waves in tile units; above half the thickness.
+    segments, sides : int
+        Quads along a yarn (a multiple of 2·count) and around it (a multiple of 4).
+    warp_colour, weft_colour : sequence of 3 floats
+        Base colours, linear RGB in [0, 1].
+    roughness, anisotropy, sheen : float
+        Of Mitsuba's ``principled``, in [0, 1]; fibres run along the yarn.
+    backing_colour : sequence of 3 floats, or None
+        Lambertian plane under the cloth, seen through its holes; None leaves the holes open (black).
+
+    Returns
+    -------
+    Mesostructure
+
+    Raises
+    ------
+    InputError
+        A value out of range, or yarns that would meet.
+    """
+    count = whole("tissue", "count", count, 2, 64, 2)
+    width = number("tissue", "width", width, 0.05, 0.95)
+    thickness = number("tissue", "thickness", thickness, 1e-4, 0.5)
+    amplitude = number("tissue", "amplitude", amplitude, 1e-4, 0.5)
+    segments = whole("tissue", "segments", segments, 4 * count, 8192, 2 * count)
+    sides = whole("tissue", "sides", sides, 8, 1024, 4)
+    roughness = number("tissue", "roughness", roughness, 0.01, 1.0)
+    anisotropy = number("tissue", "anisotropy", anisotropy, 0.0, 1.0)
+    sheen = number("tissue", "sheen", sheen, 0.0, 1.0)
+    warp_colour = colour("tissue", "warp_colour", warp_colour)
+    weft_colour = colour("tissue", "weft_colour", weft_colour)
+    if backing_colour is not None:
+        backing_colour = colour("tissue", "backing_colour", backing_colour)
+
+    across = np.linspace(0.0, 1.0, 1025)
+    rest = 2 * amplitude / thickness * np.cos(0.5 * np.pi * width * across) - np.sqrt(1 - across**2)
+    if rest.min() < _CLEARANCE:
+        raise InputError(
+            "yarns would meet",
+            field="amplitude",
+            got=amplitude,
+            expected="a larger one, or narrower or thinner yarns",
+        )
+
+    def fibre(base):
+        return {
+            "type": "principled",
+            "base_color": {"type": "rgb", "value": base},
+            "roughness": roughness,
+            "anisotropic": anisotropy,
+            "sheen": sheen,
+            "sheen_tint": 0.5,
+            "specular": 0.4,
+        }
+
+    warp = _yarns(count, width, thickness, amplitude, segments, sides)
+    vertices, normals, uv, faces = warp
+    # Mirrored in the plane x = y, and turned over: where the warp is up, the weft is down.
+    turn = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]], np.float64)
+    parts = [
+        Part(vertices, faces, fibre(warp_colour), normals=normals, uv=uv),
+        Part(vertices @ turn.T, faces, fibre(weft_colour), normals=normals @ turn.T, uv=uv),
+    ]
+    top = max(part.vertices[:, 2].max() for part in parts)
+    parts = [
+        Part(part.vertices - [0, 0, top], part.faces, part.bsdf, normals=part.normals, uv=part.uv)
+        for part in parts
+    ]
+    if backing_colour is not None:
+        low = min(part.vertices[:, 2].min() for part in parts) - 0.05 * thickness
+        square = np.array([[0, 0, low], [1, 0, low], [1, 1, low], [0, 1, low]], np.float64)
+        cloth = {"type": "diffuse", "reflectance": {"type": "rgb", "value": backing_colour}}
+        parts.append(Part(square, [[0, 1, 2], [0, 2, 3]], cloth, normals=np.tile([0.0, 0.0, 1.0], (4, 1))))
+    parameters = {
+        "count": count,
+        "width": width,
+        "thickness": thickness,
+        "amplitude": amplitude,
+        "segments": segments,
+        "sides": sides,
+        "warp_colour": warp_colour,
+        "weft_colour": weft_colour,
+        "roughness": roughness,
+        "anisotropy": anisotropy,
+        "sheen": sheen,
+        "backing_colour": backing_colour,
+    }
+    return Mesostructure("tissue", parameters, tuple(parts))
+
+
+def _yarns(count, width, thickness, amplitude, segments, sides):
+    """Warp yarns: vertices, normals, texture coordinates (u along the yarn) and faces, z around 0."""
+    n_along = segments + 1
+    x = np.arange(n_along) / segments
+    # The last ring of vertices is the first one of the next tile, bit for bit.
+    phase = np.pi * count * (np.arange(n_along) % segments) / segments
+    around = -2 * np.pi * np.arange(sides) / sides
+    half_width, half_thickness = 0.5 * width / count, 0.5 * thickness
+    vertices, normals, uv, faces = [], [], [], []
+    for index in range(count):
+        sign = 1 if index % 2 == 0 else -1
+        # Extremes at the crossings x = (j + 1/2)/count: a sine of that phase.
+        height = sign * amplitude * np.sin(phase)
+        slope = sign * amplitude * np.pi * count * np.cos(phase)
+        y = (index + 0.5) / count + half_width * np.cos(around)
+        z = height[:, None] + half_thickness * np.sin(around)
+        ring = np.stack(np.broadcast_arrays(x[:, None], y[None, :], z), -1)
+        # Sections stay upright (a sheared sweep), so the normal is that of the section, tilted by the slope.
+        across = np.cos(around) / half_width
+        up = np.sin(around) / half_thickness
+        normal = np.stack(np.broadcast_arrays(-slope[:, None] * up, across, up), -1)
+        normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+        vertices.append(ring.reshape(-1, 3))
+        normals.append(normal.reshape(-1, 3))
+        texture = np.broadcast_arrays(x[:, None], np.arange(sides)[None, :] / sides)
+        uv.append(np.stack(texture, -1).reshape(-1, 2))
+        faces.append(sweep_faces(n_along, sides) + index * n_along * sides)
+    return tuple(np.concatenate(parts) for parts in (vertices, normals, uv, faces))
