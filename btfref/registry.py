@@ -92,7 +92,9 @@ def methods():
     for point in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda p: (p.name, p.value)):
         row = point.load()
         if row.key in rows:
-            raise InputError("two packages provide one method", field=ENTRY_POINT_GROUP, got=f"{row.key} ({point.value})")
+            raise InputError(
+                "two packages provide one method", field=ENTRY_POINT_GROUP, got=f"{row.key} ({point.value})"
+            )
         rows[row.key] = row
     return rows
 

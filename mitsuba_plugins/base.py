@@ -66,7 +66,9 @@ def uv_transform(matrix):
     m = np.asarray(matrix, float)
     affine = np.concatenate([m[:2, :2], m[:2, -1:]], 1)
     if np.linalg.det(affine[:, :2]) <= 0:
-        raise InputError("the transform mirrors or is singular", field="to_uv", expected="a positive determinant")
+        raise InputError(
+            "the transform mirrors or is singular", field="to_uv", expected="a positive determinant"
+        )
     c, s = float(affine[0, 0] + affine[1, 1]), float(affine[1, 0] - affine[0, 1])
     length = float(np.hypot(c, s))
     return affine, ((c / length, s / length) if length > 0 else (1.0, 0.0))
@@ -105,7 +107,9 @@ def make_bsdf():
             sampling = _choice(props, "sampling", "data", ("data", "cosine"))
             scale = float(_parameter(props, "scale", 1.0))
             if not (np.isfinite(scale) and scale >= 0):
-                raise InputError("the scale is out of range", field="scale", got=scale, expected="a finite value ≥ 0")
+                raise InputError(
+                    "the scale is out of range", field="scale", got=scale, expected="a finite value ≥ 0"
+                )
             self.scale = mi.Float(scale)
             affine, self.rotation = uv_transform(_matrix(_parameter(props, "to_uv", None)))
             # Python floats: NumPy scalars would try to read a symbolic operand.
@@ -124,13 +128,18 @@ def make_bsdf():
             self.m_components = [flags]
             self.m_flags = flags
 
-        def _local(self, ctx, si, wo):
-            """Texture coordinates and directions in the texture's frame."""
-            uv = mi.Point2f(*(dr.fma(si.uv.x, a, dr.fma(si.uv.y, b, c)) for a, b, c in self.affine))
-            w_view, w_light = self._turn(si.wi), self._turn(wo)
-            if ctx.mode == mi.TransportMode.Importance:
-                w_view, w_light = w_light, w_view
-            return uv, w_light, w_view
+        def _uv(self, si):
+            return mi.Point2f(*(dr.fma(si.uv.x, a, dr.fma(si.uv.y, b, c)) for a, b, c in self.affine))
+
+        def _local(self, w):
+            """A direction in the texture's frame, and whether it is valid; the pole stands in for invalid ones.
+
+            Sanitized one by one, so that what depends on the view alone is recorded once for all methods that a
+            kernel calls.
+            """
+            w = self._turn(w)
+            valid = valid_directions(w)
+            return dr.select(valid, w, mi.Vector3f(0, 0, 1)), valid
 
         def _turn(self, w, sign=1):
             c, s = self.rotation
@@ -142,32 +151,25 @@ def make_bsdf():
         def _enabled(ctx):
             return ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
 
-        def _evaluate(self, uv, w_light, w_view, active):
-            active = active & valid_directions(w_light) & valid_directions(w_view)
-            # Invalid lanes look up the pole: no index may leave its table.
-            up = mi.Vector3f(0, 0, 1)
-            w_light, w_view = dr.select(active, w_light, up), dr.select(active, w_view, up)
-            value = self.evaluator.evaluate(uv, w_light, w_view, active)
-            return dr.select(active, value * self.scale, 0), w_light, w_view, active
-
         def eval(self, ctx, si, wo, active=True):
             if not self._enabled(ctx):
                 return mi.Color3f(0)
-            return self._evaluate(*self._local(ctx, si, wo), mi.Bool(active))[0]
+            w_view, view_valid = self._local(si.wi)
+            w_light, light_valid = self._local(wo)
+            active = mi.Bool(active) & view_valid & light_valid
+            if ctx.mode == mi.TransportMode.Importance:
+                w_view, w_light = w_light, w_view
+            value = self.evaluator.evaluate(self._uv(si), w_light, w_view, active)
+            return dr.select(active, value * self.scale, 0)
 
         def pdf(self, ctx, si, wo, active=True):
             if not self._enabled(ctx):
                 return mi.Float(0)
-            uv, w_light, w_view, active = self._guided(ctx, si, wo, mi.Bool(active))
-            return self.guide.pdf(self.guide.neighbours(uv, w_view, active), w_light, active)
-
-        def _guided(self, ctx, si, wo, active):
-            """As :meth:`_local`, for the guide: the sampled direction always plays the light."""
-            a_ctx = mi.BSDFContext(mi.TransportMode.Radiance)
-            uv, w_light, w_view = self._local(a_ctx, si, wo)
-            active = active & valid_directions(w_light) & valid_directions(w_view)
-            up = mi.Vector3f(0, 0, 1)
-            return uv, dr.select(active, w_light, up), dr.select(active, w_view, up), active
+            # The sampled direction always plays the light: a guide for importance transport is not worth its memory.
+            w_view, view_valid = self._local(si.wi)
+            w_light, light_valid = self._local(wo)
+            active = mi.Bool(active) & view_valid & light_valid
+            return self.guide.pdf(self.guide.neighbours(self._uv(si), w_view), w_light, active)
 
         def eval_pdf(self, ctx, si, wo, active=True):
             return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
@@ -176,19 +178,16 @@ def make_bsdf():
             bs = dr.zeros(mi.BSDFSample3f)
             if not self._enabled(ctx):
                 return bs, mi.Color3f(0)
-            active = mi.Bool(active) & valid_directions(si.wi)
-            wi = dr.select(active, si.wi, mi.Vector3f(0, 0, 1))
-            uv, _, w_view, _ = self._guided(ctx, si, wi, active)
-            neighbours = self.guide.neighbours(uv, w_view, active)
-            w_light = self.guide.sample(neighbours, sample1, sample2, active)
+            w_view, view_valid = self._local(si.wi)
+            active = mi.Bool(active) & view_valid
+            w_light = self.guide.sample(self.guide.neighbours(self._uv(si), w_view), sample1, sample2)
             bs.wo = self._turn(w_light, -1)
             bs.eta = 1.0
             bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
             bs.sampled_component = 0
-            value, pdf = self.eval_pdf(ctx, si, bs.wo, active)
-            bs.pdf = pdf
-            usable = active & (pdf > 0)
-            return bs, dr.select(usable, value / pdf, 0)
+            value, bs.pdf = self.eval_pdf(ctx, si, bs.wo, active)
+            usable = active & (bs.pdf > 0)
+            return bs, dr.select(usable, value / bs.pdf, 0)
 
         def traverse(self, callback):
             callback.put("scale", self.scale, mi.ParamFlags.Differentiable)
@@ -210,13 +209,15 @@ def make_bsdf():
 
 
 def _parameter(props, name, default):
-    return props[name] if name in props else default  # noqa: SIM401  (Properties has no get with default)
+    return props[name] if name in props else default
 
 
 def _choice(props, name, default, choices):
     value = _parameter(props, name, default)
     if value not in choices:
-        raise InputError("unknown value of a parameter", field=name, got=repr(value), expected=" or ".join(choices))
+        raise InputError(
+            "unknown value of a parameter", field=name, got=repr(value), expected=" or ".join(choices)
+        )
     return value
 
 

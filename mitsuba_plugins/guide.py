@@ -18,6 +18,10 @@ from btfref.numerics import interpolation
 N_RADIAL, N_AZIMUTH = 8, 32
 N_CELLS = N_RADIAL * N_AZIMUTH
 
+#: An entry of an alias table is one word: the alias below, the threshold above.
+ALIAS_BITS = N_CELLS.bit_length() - 1
+ALIAS_STEPS = 1 << (32 - ALIAS_BITS)
+
 #: Share of pure cosine sampling: bounds the weight of a sample by 1 / share times that of cosine sampling, for texels
 #: that differ from their group's mean.
 COSINE_SHARE = 0.4
@@ -62,6 +66,43 @@ def cell_densities(mean, lights):
     return (COSINE_SHARE + (1 - COSINE_SHARE) * density).astype(np.float32)
 
 
+def alias_tables(weights):
+    """Alias tables (Walker 1977, in Vose's construction, all rows at once).
+
+    Parameters
+    ----------
+    weights : ndarray, shape (n_tables, N_CELLS)
+        Positive; proportional to the probabilities.
+
+    Returns
+    -------
+    ndarray of uint32, shape (n_tables, N_CELLS)
+        Threshold in steps of 1 / ``ALIAS_STEPS`` above the ``ALIAS_BITS`` low bits, which hold the alias.
+    """
+    n_tables, n = weights.shape
+    share = np.asarray(weights, float) * (n / weights.sum(1, keepdims=True))
+    order = np.argsort(share, axis=1)
+    row = np.arange(n_tables)
+    threshold, alias = np.ones((n_tables, n)), np.tile(np.arange(n), (n_tables, 1))
+    # Cells sorted by share: ``small`` walks up from the poorest, ``large`` down from the richest. A rich cell that has
+    # given away its surplus is the next poor one.
+    small, large = np.zeros(n_tables, int), np.full(n_tables, n - 1)
+    poor = order[row, small]
+    for _ in range(n - 1):
+        rich = order[row, large]
+        threshold[row, poor] = np.minimum(share[row, poor], 1)
+        alias[row, poor] = rich
+        share[row, rich] -= 1 - threshold[row, poor]
+        exhausted = (share[row, rich] < 1) & (large - 1 > small)
+        small = np.where(exhausted, small, small + 1)
+        poor = np.where(exhausted, rich, order[row, np.minimum(small, n - 1)])
+        large = np.where(exhausted, large - 1, large)
+        # A table whose walkers met is done: the rest keeps itself.
+        poor = np.where(small >= large, order[row, large], poor)
+    steps = np.round(threshold * ALIAS_STEPS).astype(np.uint32)
+    return np.minimum(steps, ALIAS_STEPS - 1) << ALIAS_BITS | alias.astype(np.uint32)
+
+
 class LightGuide:
     """Samples and densities of light directions for one representation.
 
@@ -80,31 +121,27 @@ class LightGuide:
             group, density = np.zeros_like(group), np.ones((1, mean.shape[1], N_CELLS), np.float32)
         else:
             density = cell_densities(mean, interpolation.from_arrays(representation.arrays(), "light"))
-        rows = density.reshape(*density.shape[:2], N_RADIAL, N_AZIMUTH)
-        marginal = np.cumsum(rows.sum(-1), -1)
-        conditional = np.cumsum(rows, -1)
         self.views = views
         self.shape = group.shape
         self.n_views = density.shape[1]
         self.single_group = density.shape[0] == 1
         self.group = mi.UInt32(np.ascontiguousarray(group, np.uint32).ravel())
         self.density = mi.Float(density.ravel())
-        self.marginal = mi.Float((marginal / marginal[..., -1:]).astype(np.float32).ravel())
-        self.conditional = mi.Float((conditional / conditional[..., -1:]).astype(np.float32).ravel())
-        dr.eval(self.group, self.density, self.marginal, self.conditional)
+        self.alias = mi.UInt32(alias_tables(density.reshape(-1, N_CELLS)).ravel())
+        dr.eval(self.group, self.density, self.alias)
 
-    def _first_table(self, uv, active):
+    def _first_table(self, uv):
         """Index of the tables of the texel's group."""
         if self.single_group:
             return mi.UInt32(0)
         from mitsuba_plugins.lookup import texel_stencil
 
         (texel,), _ = texel_stencil(uv, self.shape, "nearest")
-        return dr.gather(mi.UInt32, self.group, texel, active) * self.n_views
+        return dr.gather(mi.UInt32, self.group, texel) * self.n_views
 
-    def neighbours(self, uv, w_view, active):
+    def neighbours(self, uv, w_view):
         """Tables that the view direction blends, as a list of (table, weight); weights sum to 1."""
-        first = self._first_table(uv, active)
+        first = self._first_table(uv)
         return [
             (first + view, weight)
             for neighbour in self.views.stencil(w_view)
@@ -121,11 +158,11 @@ class LightGuide:
         cell = row * N_AZIMUTH + column
         density = mi.Float(0)
         for table, weight in neighbours:
-            value = dr.gather(mi.Float, self.density, table * N_CELLS + cell, active)
+            value = dr.gather(mi.Float, self.density, table * N_CELLS + cell)
             density = dr.fma(value, weight, density)
         return dr.select(active, density * dr.maximum(w_light.z, 0) * dr.inv_pi, 0)
 
-    def sample(self, neighbours, sample1, sample2, active):
+    def sample(self, neighbours, sample1, sample2):
         """A light direction with density :meth:`pdf`.
 
         Parameters
@@ -135,33 +172,26 @@ class LightGuide:
         sample1 : Float
             Chooses among the neighbouring views.
         sample2 : Point2f
-            Warped to the hemisphere; stratification survives within a view's table.
+            Chooses the cell and the position in it.
         """
         table, cumulative = neighbours[0][0], mi.Float(0)
         for following, weight in neighbours:
             # A view without weight is never chosen: its interval is empty.
             table = dr.select((sample1 >= cumulative) & (weight > 0), following, table)
             cumulative = cumulative + weight
-        row, x = self._invert(self.marginal, table * N_RADIAL, N_RADIAL, sample2.x, active)
-        column, y = self._invert(
-            self.conditional, (table * N_RADIAL + row) * N_AZIMUTH, N_AZIMUTH, sample2.y, active
+        scaled = sample2.x * N_CELLS
+        cell = dr.minimum(mi.UInt32(scaled), N_CELLS - 1)
+        rest = scaled - mi.Float(cell)
+        entry = dr.gather(mi.UInt32, self.alias, table * N_CELLS + cell)
+        threshold = mi.Float(entry >> ALIAS_BITS) * (1 / ALIAS_STEPS)
+        keep = rest < threshold
+        cell = dr.select(keep, cell, entry & (N_CELLS - 1))
+        # What is left of the first number, after its two decisions, is uniform again.
+        x = dr.select(
+            keep, rest / dr.maximum(threshold, 1e-20), (rest - threshold) / dr.maximum(1 - threshold, 1e-20)
         )
-        radial = (mi.Float(row) + x) / N_RADIAL
-        azimuth = (mi.Float(column) + y) * (2 * np.pi / N_AZIMUTH)
+        radial = (mi.Float(cell // N_AZIMUTH) + dr.clip(x, 0, dr.one_minus_epsilon(mi.Float))) / N_RADIAL
+        azimuth = (mi.Float(cell % N_AZIMUTH) + sample2.y) * (2 * np.pi / N_AZIMUTH)
         r = dr.sqrt(radial)
         s, c = dr.sincos(azimuth)
         return mi.Vector3f(r * c, r * s, dr.sqrt(dr.maximum(1 - radial, 0)))
-
-    @staticmethod
-    def _invert(table, start, n, sample, active):
-        """Cell of a cumulative table that holds ``sample``, and the position inside of it in [0, 1)."""
-        index, low, step = mi.UInt32(0), mi.Float(0), n // 2
-        while step:
-            value = dr.gather(mi.Float, table, start + index + (step - 1), active)
-            right = sample >= value
-            index = dr.select(right, index + step, index)
-            low = dr.select(right, value, low)
-            step //= 2
-        high = dr.gather(mi.Float, table, start + index, active)
-        position = (sample - low) / dr.maximum(high - low, 1e-20)
-        return index, dr.clip(position, 0, dr.one_minus_epsilon(mi.Float))

@@ -21,8 +21,8 @@ HALF_SCALE = 2.0**112 / HALF_SHIFT
 
 
 #: Entries up to this many values are blended in straight-line code; wider ones loop over views, since the time to
-#: compile a kernel grows faster than its length.
-UNROLLED_WIDTH = 16
+#: compile a kernel grows faster than its length, and the longer code of 16 values is also a fifth slower to run.
+UNROLLED_WIDTH = 8
 
 
 def valid_directions(w):
@@ -44,7 +44,9 @@ def angle_of(y, x):
     small, large = dr.minimum(ax, ay), dr.maximum(ax, ay)
     # Beyond tan(π/8) the remainder is taken from the diagonal: atan(s/l) = π/4 + atan((s − l)/(s + l)).
     diagonal = small > 0.41421357 * large
-    q = dr.select(diagonal, small - large, small) / dr.maximum(dr.select(diagonal, small + large, large), 1e-37)
+    q = dr.select(diagonal, small - large, small) / dr.maximum(
+        dr.select(diagonal, small + large, large), 1e-37
+    )
     z = q * q
     # Minimax fit of (atan(q)/q − 1)/q² on [0, tan(π/8)], relative error below 1e-9.
     p = mi.Float(-0.060823050)
@@ -139,7 +141,9 @@ class RingTable:
         for ring, share in ((low, (1 - t) * fade), (high, t * fade)):
             count = choose(self.rings[ring, 2])
             # Whole and fractional parts apart: a sum of magnitude ``count`` would round the fraction.
-            start = dr.fma(eighths, 0.125 * count, -choose(self.rings[ring, 1] / (2 * np.pi) * self.rings[ring, 2]))
+            start = dr.fma(
+                eighths, 0.125 * count, -choose(self.rings[ring, 1] / (2 * np.pi) * self.rings[ring, 2])
+            )
             whole = dr.floor(start)
             position = dr.fma(rest, count * (0.5 / np.pi), start - whole)
             carry = dr.floor(position)
@@ -324,7 +328,9 @@ class PairTable:
                 words = read_packets(self.words, base + light.index, self.width, active)
                 halves = [widened(word) for word in words[: 3 * len(coefficients)]]
                 total = _add(total, [low for low, _ in halves], coefficients, weight * light.weight)
-                total = _add(total, [high for _, high in halves], coefficients, weight * light.following_weight)
+                total = _add(
+                    total, [high for _, high in halves], coefficients, weight * light.following_weight
+                )
                 continue
             for index, light_weight in light.single():
                 total = _add(total, self._values(base + index, active), coefficients, weight * light_weight)
@@ -334,7 +340,11 @@ class PairTable:
         """The values of an entry one by one, not yet multiplied by ``HALF_SCALE``."""
         if self.words is None:
             return [mi.Float(value) for value in read_packets(self.values, entry, self.width, active)]
-        return [half for word in read_packets(self.words, entry, self.width // 2, active) for half in widened(word)]
+        return [
+            half
+            for word in read_packets(self.words, entry, self.width // 2, active)
+            for half in widened(word)
+        ]
 
 
 def widened(word):
@@ -354,6 +364,15 @@ def _add(total, values, coefficients, weight):
             value = dr.fma(values[3 * j + channel], coefficient, value)
         result.append(dr.fma(value, weight, total[channel]))
     return mi.Color3f(*result)
+
+
+def wide(values):
+    """Values of a small table as float32, which is read in packets; differentiable ones are left as they are."""
+    if dr.grad_enabled(values.array) or dr.type_v(values.array) != dr.VarType.Float16:
+        return values.array
+    result = mi.Float(values.array)
+    dr.eval(result)
+    return result
 
 
 def read_packets(array, entry, width, active=True):

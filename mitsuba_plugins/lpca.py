@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_plugins.lookup import PairTable, read_packets, texel_stencil
+from mitsuba_plugins.lookup import PairTable, read_packets, texel_stencil, wide
 
 
 class Evaluator:
@@ -22,7 +22,7 @@ class Evaluator:
         weights = maps.tensors["weights"]
         self.differentiable = dr.grad_enabled(weights) or dr.grad_enabled(maps.tensors["basis"])
         self.basis = PairTable(maps.tensors["basis"], self.lights.following())
-        self.weights, self.width = weights.array, weights.shape[-1]
+        self.weights, self.width = wide(weights), weights.shape[-1]
         # Padding of the index map served the shader's texels only.
         self.cluster = mi.UInt32(maps.tensors["cluster"].array)
         self.cluster_stride = maps.tensors["cluster"].shape[-1]
@@ -41,7 +41,7 @@ class Evaluator:
             for texel, share in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True)
         ]
         if len(texels) == 1:
-            (cluster, coefficient), = texels
+            ((cluster, coefficient),) = texels
             return self.basis.combine(cluster, views, lights, coefficient, active)
         if self.differentiable:
             # Gradients do not reach variables that a loop captures.
@@ -60,7 +60,10 @@ class Evaluator:
                 owner = dr.select(cluster == clusters[j], j, owner)
             owners.append(owner)
         merged = [
-            [sum(dr.select(owners[j] == i, texels[j][1][k], 0) for j in range(i, len(texels))) for k in range(len(c))]
+            [
+                sum(dr.select(owners[j] == i, texels[j][1][k], 0) for j in range(i, len(texels)))
+                for k in range(len(c))
+            ]
             for i, (_, c) in enumerate(texels)
         ]
         # The owners in use move to the front, so that the loop below ends after the last of them.
@@ -80,6 +83,9 @@ class Evaluator:
             return step + 1, total
 
         _, total = dr.while_loop(
-            (mi.UInt32(0), mi.Color3f(0)), lambda step, total: active & (step < n_distinct), body, label="lpca"
+            (mi.UInt32(0), mi.Color3f(0)),
+            lambda step, total: active & (step < n_distinct),
+            body,
+            label="lpca",
         )
         return total

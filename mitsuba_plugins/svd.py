@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_plugins.lookup import PairTable, read_packets, texel_stencil
+from mitsuba_plugins.lookup import PairTable, read_packets, texel_stencil, wide
 
 
 class Evaluator:
@@ -21,7 +21,7 @@ class Evaluator:
         """Take over changed maps."""
         basis, weights = maps.tensors["basis"], maps.tensors["weights"]
         self.basis = PairTable(type(basis)(basis.array, (1, *basis.shape)), self.lights.following())
-        self.weights, self.width = weights.array, weights.shape[-1]
+        self.weights, self.width = wide(weights), weights.shape[-1]
 
     def evaluate(self, uv, w_light, w_view, active):
         """B in 1/sr for valid directions; may be slightly negative."""

@@ -14,7 +14,8 @@ def oracle_values(shape, views, lights, seed=0):
     v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
     checker = 0.5 + 0.5 * np.tanh(6 * np.sin(2 * np.pi * u) * np.sin(2 * np.pi * v))
     normal = np.stack(
-        [0.6 * np.cos(2 * np.pi * u) * np.sin(2 * np.pi * v), 0.5 * np.sin(2 * np.pi * u), np.ones_like(u)], -1
+        [0.6 * np.cos(2 * np.pi * u) * np.sin(2 * np.pi * v), 0.5 * np.sin(2 * np.pi * u), np.ones_like(u)],
+        -1,
     )
     normal += 0.02 * np.random.default_rng(seed).normal(size=normal.shape)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -33,4 +34,6 @@ def oracle_btf(shape=(16, 12), views="ubo81", lights="ubo81", dtype="float16", s
     """The values of :func:`oracle_values` as a :class:`SampledBTF`."""
     views, lights = directions(views), directions(lights)
     values = oracle_values(shape, views, lights, seed).astype(dtype)
-    return SampledBTF(values=values, views=views, lights=lights, variance=None, attributes={"mesostructure": "oracle"})
+    return SampledBTF(
+        values=values, views=views, lights=lights, variance=None, attributes={"mesostructure": "oracle"}
+    )

@@ -130,7 +130,9 @@ def directions(spec):
         grid = re.fullmatch(r"([1-9]\d{0,3})x([1-9]\d{0,3})", spec)
         if grid is None:
             raise InputError(
-                "unknown set of directions", got=repr(spec), expected=f"{', '.join(NAMED_RINGS)} or a grid such as 10x5"
+                "unknown set of directions",
+                got=repr(spec),
+                expected=f"{', '.join(NAMED_RINGS)} or a grid such as 10x5",
             )
         n_theta, n_phi = map(int, grid.groups())
         rings = [((i + 0.5) * 90 / n_theta, n_phi, 0) for i in range(n_theta)]
@@ -141,7 +143,9 @@ def directions(spec):
 def checked(vectors, name, *, file=None):
     """A :class:`DirectionSet` of ``vectors`` after the checks that :func:`directions` documents."""
     if vectors.ndim != 2 or vectors.shape[1] != 3 or len(vectors) == 0:
-        raise InputError("directions have the wrong shape", file=file, got=vectors.shape, expected="(n, 3) with n ≥ 1")
+        raise InputError(
+            "directions have the wrong shape", file=file, got=vectors.shape, expected="(n, 3) with n ≥ 1"
+        )
     if not np.isfinite(vectors).all():
         raise InputError("directions hold a value that is not finite", file=file)
     length = np.linalg.norm(vectors, axis=1)
@@ -152,7 +156,10 @@ def checked(vectors, name, *, file=None):
     vectors = np.where(unit[:, None], vectors, vectors / length[:, None])
     if (vectors[:, 2] < -1e-9).any():
         raise InputError(
-            "a direction lies below the horizon", file=file, got=f"z = {vectors[:, 2].min():.3g}", expected="z ≥ 0"
+            "a direction lies below the horizon",
+            file=file,
+            got=f"z = {vectors[:, 2].min():.3g}",
+            expected="z ≥ 0",
         )
     if len(np.unique(np.round(vectors, 9), axis=0)) < len(vectors):
         raise InputError("directions occur twice", file=file)

@@ -28,7 +28,9 @@ def gauss_hemisphere(n_theta, n_phi):
     z = np.repeat((node + 1) / 2, n_phi)
     phi = np.tile((np.arange(n_phi) + 0.5) * (2 * np.pi / n_phi), n_theta)
     r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(phi), r * np.sin(phi), z], -1), np.repeat(weight / 2, n_phi) * (2 * np.pi / n_phi)
+    return np.stack([r * np.cos(phi), r * np.sin(phi), z], -1), np.repeat(weight / 2, n_phi) * (
+        2 * np.pi / n_phi
+    )
 
 
 def _monomials(w, degree):
@@ -36,7 +38,13 @@ def _monomials(w, degree):
     x, y, z = np.asarray(w).T
     # z² = 1 − x² − y² on the sphere, so powers of z above one add nothing.
     return np.stack(
-        [x**i * y**j * z**k for k in (0, 1) for i in range(degree + 1) for j in range(degree + 1) if i + j + k <= degree]
+        [
+            x**i * y**j * z**k
+            for k in (0, 1)
+            for i in range(degree + 1)
+            for j in range(degree + 1)
+            if i + j + k <= degree
+        ]
     )
 
 

@@ -48,10 +48,15 @@ def save(representation, path):
         "meta": representation.meta,
         "arrays": {name: {"shape": list(a.shape), "dtype": a.dtype.name} for name, a in arrays.items()},
     }
-    images = {name: array.reshape(*_image_size(array.shape), array.shape[-1]) for name, array in arrays.items()}
+    images = {
+        name: array.reshape(*_image_size(array.shape), array.shape[-1]) for name, array in arrays.items()
+    }
     display = (
         np.zeros(2, np.int32),
-        np.array([max(i.shape[1] for i in images.values()) - 1, max(i.shape[0] for i in images.values()) - 1], np.int32),
+        np.array(
+            [max(i.shape[1] for i in images.values()) - 1, max(i.shape[0] for i in images.values()) - 1],
+            np.int32,
+        ),
     )
     parts = []
     for name, image in images.items():
@@ -62,12 +67,16 @@ def save(representation, path):
             "type": OpenEXR.scanlineimage,
             "compression": OpenEXR.ZIP_COMPRESSION,
             "displayWindow": display,
-            "dataWindow": (np.zeros(2, np.int32), np.array([image.shape[1] - 1, image.shape[0] - 1], np.int32)),
+            "dataWindow": (
+                np.zeros(2, np.int32),
+                np.array([image.shape[1] - 1, image.shape[0] - 1], np.int32),
+            ),
         }
         if not parts:
             header[ATTRIBUTE] = json.dumps(manifest, sort_keys=True)
         channels = {
-            channel: np.ascontiguousarray(image[..., i]) for i, channel in enumerate(_channel_names(image.shape[-1]))
+            channel: np.ascontiguousarray(image[..., i])
+            for i, channel in enumerate(_channel_names(image.shape[-1]))
         }
         parts.append(OpenEXR.Part(header, channels, name))
     if not path.parent.is_dir():
@@ -189,7 +198,9 @@ def _open(path, *, header_only):
     with path.open("rb") as stream:
         magic = stream.read(4)
     if magic != _MAGIC:
-        raise InputError("not an OpenEXR file", file=path, field="magic number", got=magic.hex(), expected=_MAGIC.hex())
+        raise InputError(
+            "not an OpenEXR file", file=path, field="magic number", got=magic.hex(), expected=_MAGIC.hex()
+        )
     import OpenEXR
 
     try:
@@ -200,7 +211,9 @@ def _open(path, *, header_only):
     except (RuntimeError, ValueError, OSError, IndexError, MemoryError) as error:
         raise InputError(f"damaged or truncated OpenEXR file: {error}", file=path) from error
     if text is None:
-        raise InputError("not a btfref representation", file=path, field=ATTRIBUTE, expected="a manifest attribute")
+        raise InputError(
+            "not a btfref representation", file=path, field=ATTRIBUTE, expected="a manifest attribute"
+        )
     try:
         manifest = json.loads(text)
         schema = manifest["schema"]
@@ -208,7 +221,9 @@ def _open(path, *, header_only):
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError("damaged manifest", file=path, field=ATTRIBUTE, got=repr(error)) from error
     if schema > SCHEMA_VERSION:
-        raise InputError("written by a newer btfref", file=path, field="schema", got=schema, expected=f"≤ {SCHEMA_VERSION}")
+        raise InputError(
+            "written by a newer btfref", file=path, field="schema", got=schema, expected=f"≤ {SCHEMA_VERSION}"
+        )
     return manifest, parts
 
 

@@ -50,7 +50,9 @@ def evaluate_tabulated(representation, kernel, uv, w_light, w_view):
     views, lights = interpolation.from_arrays(arrays, "view"), interpolation.from_arrays(arrays, "light")
     uv, w_light, w_view = (np.asarray(a, float) for a in (uv, w_light, w_view))
     shape = np.broadcast_shapes(uv.shape[:-1], w_light.shape[:-1], w_view.shape[:-1])
-    uv, w_light, w_view = (np.broadcast_to(a, (*shape, a.shape[-1])).reshape(-1, a.shape[-1]) for a in (uv, w_light, w_view))
+    uv, w_light, w_view = (
+        np.broadcast_to(a, (*shape, a.shape[-1])).reshape(-1, a.shape[-1]) for a in (uv, w_light, w_view)
+    )
     result = np.zeros((len(uv), 3))
     for start in range(0, len(uv), CHUNK):
         part = slice(start, start + CHUNK)
@@ -121,7 +123,12 @@ def stored(name, array, storage):
     limit = float(np.finfo(STORAGE[storage]).max)
     peak = float(np.abs(array).max(initial=0))
     if not peak <= limit:
-        raise InputError(f"values do not fit {storage} floats", field=name, got=f"{peak:.4g}", expected=f"at most {limit:.4g}")
+        raise InputError(
+            f"values do not fit {storage} floats",
+            field=name,
+            got=f"{peak:.4g}",
+            expected=f"at most {limit:.4g}",
+        )
     return array.astype(STORAGE[storage])
 
 
@@ -133,5 +140,7 @@ def positive_integer(name, value):
     InputError
     """
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise InputError("a parameter is out of range", field=name, got=repr(value), expected="an integer of at least 1")
+        raise InputError(
+            "a parameter is out of range", field=name, got=repr(value), expected="an integer of at least 1"
+        )
     return int(value)

@@ -84,7 +84,9 @@ class Representation:
         n_clusters, n_colours = basis.shape[:2]
         # Coefficients over all clusters' colours, zero outside of the texel's own.
         coefficient = np.zeros((len(cluster), n_clusters, n_colours), np.float32)
-        coefficient[np.arange(len(cluster)), cluster] = np.concatenate([np.ones((len(cluster), 1)), weights], 1)
+        coefficient[np.arange(len(cluster)), cluster] = np.concatenate(
+            [np.ones((len(cluster), 1)), weights], 1
+        )
         some = basis[:, :, feature_views(basis.shape[2])].reshape(n_clusters * n_colours, -1)
         labels = texel_groups(coefficient.reshape(len(cluster), -1) @ some)
         mean = np.tensordot(group_means(labels, coefficient), basis, 2)
@@ -92,6 +94,7 @@ class Representation:
 
     @classmethod
     def from_arrays(cls, arrays, meta):
+        """See :meth:`btfref.representations.protocol.Representation.from_arrays`."""
         return cls(arrays, meta)
 
 
@@ -180,5 +183,3 @@ def _cluster_bases(matrix, labels, clusters, components, report):
         error += float(np.einsum("ij,ij->", block, block, dtype=np.float64))
         error -= float((weights[members].astype(float) ** 2).sum())
     return means, axes, weights, max(error, 0.0)
-
-

@@ -27,7 +27,13 @@ class Representation:
 
         def kernel(s):
             index = (s.texel[:, :, None, None], s.view[:, None, :, None], s.light[:, None, None, :])
-            return np.einsum("nt,nv,nl,ntvlc->nc", s.texel_weight, s.view_weight, s.light_weight, table[index].astype(float))
+            return np.einsum(
+                "nt,nv,nl,ntvlc->nc",
+                s.texel_weight,
+                s.view_weight,
+                s.light_weight,
+                table[index].astype(float),
+            )
 
         return evaluate_tabulated(self, kernel, uv, w_light, w_view)
 
@@ -49,6 +55,7 @@ class Representation:
 
     @classmethod
     def from_arrays(cls, arrays, meta):
+        """See :meth:`btfref.representations.protocol.Representation.from_arrays`."""
         return cls(arrays, meta)
 
 

@@ -69,6 +69,7 @@ class Representation:
 
     @classmethod
     def from_arrays(cls, arrays, meta):
+        """See :meth:`btfref.representations.protocol.Representation.from_arrays`."""
         return cls(arrays, meta)
 
 

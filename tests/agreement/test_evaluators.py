@@ -27,9 +27,7 @@ def directions_of(kind, rng):
 @pytest.fixture(scope="module")
 def btfs():
     rng = np.random.default_rng(3)
-    return {
-        kind: oracle_btf((24, 20), directions_of(kind, rng), directions_of(kind, rng)) for kind in SETS
-    }
+    return {kind: oracle_btf((24, 20), directions_of(kind, rng), directions_of(kind, rng)) for kind in SETS}
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +77,7 @@ def assert_agrees(value, representation, points):
 
 def test_drjit_agrees(case, llvm):
     import drjit as dr
+
     import mitsuba_plugins
 
     representation, path, filter_type, points = case
@@ -104,7 +103,9 @@ def test_glsl_agrees(case, need):
 def test_swapped_directions_are_caught(key, fitted, btfs):
     """A BTF is not reciprocal: an evaluator that swaps light and view must not pass."""
     representation, _ = fitted(key, "ubo81")
-    uv, w_light, w_view = probe_points(np.random.default_rng(7), 2000, btfs["ubo81"].views, btfs["ubo81"].lights)
+    uv, w_light, w_view = probe_points(
+        np.random.default_rng(7), 2000, btfs["ubo81"].views, btfs["ubo81"].lights
+    )
     swapped = representation.evaluate(uv, w_view, w_light)
     assert not agreement(swapped, representation.evaluate(uv, w_light, w_view)).passed
 
@@ -113,6 +114,7 @@ def test_swapped_directions_are_caught(key, fitted, btfs):
 def test_invalid_lookups_are_zero_everywhere(key, fitted, llvm, need):
     """Below the horizon, NaN, infinite: exactly 0 in all evaluators; non-finite uv count as 0."""
     import drjit as dr
+
     import mitsuba_plugins
     from btfref.render.probe import probe
 

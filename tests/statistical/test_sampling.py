@@ -62,14 +62,21 @@ def test_samples_follow_the_density(path, view, llvm, tmp_path, monkeypatch):
     for uv in UVS:
 
         def sample(s, uv=uv):
-            bs, _ = bsdf.sample(context, interaction(mi, dr.width(s), uv, w_view), s[0], mi.Point2f(s[1], s[2]))
+            bs, _ = bsdf.sample(
+                context, interaction(mi, dr.width(s), uv, w_view), s[0], mi.Point2f(s[1], s[2])
+            )
             return bs.wo, dr.select(bs.pdf > 0, mi.Float(1), 0)
 
         def pdf(w, uv=uv):
             return bsdf.pdf(context, interaction(mi, dr.width(w), uv, w_view), w)
 
         test = mi.chi2.ChiSquareTest(
-            domain=mi.chi2.SphericalDomain(), sample_func=sample, pdf_func=pdf, sample_dim=3, sample_count=SAMPLES, ires=16
+            domain=mi.chi2.SphericalDomain(),
+            sample_func=sample,
+            pdf_func=pdf,
+            sample_dim=3,
+            sample_count=SAMPLES,
+            ires=16,
         )
         n_tests = len(VIEWS) * len(UVS) * (len(methods()) + 1)
         assert test.run(tolerance("chi2.significance"), test_count=n_tests, quiet=True), test.messages
@@ -91,7 +98,9 @@ def test_density_integrates_to_one(path, view, llvm):
     bsdf = load(mi, path)
     w, solid_angle = grid()
     for uv in UVS:
-        pdf = np.array(bsdf.pdf(mi.BSDFContext(), interaction(mi, len(w), uv, unit(VIEWS[view])), mi.Vector3f(w.T)))
+        pdf = np.array(
+            bsdf.pdf(mi.BSDFContext(), interaction(mi, len(w), uv, unit(VIEWS[view])), mi.Vector3f(w.T))
+        )
         assert abs(pdf @ solid_angle - 1) <= tolerance("pdf.integral.max")
 
 
@@ -109,7 +118,10 @@ def test_weight_is_value_over_density(path, view, llvm, rng):
         scale = np.abs(value).max()
         assert (pdf > 0).all()
         assert (np.abs(np.array(bs.pdf) - pdf) <= tolerance("sample.pdf.max") * pdf).all()
-        assert (np.abs(weight * pdf - value) <= tolerance("sample.weight.max") * np.maximum(np.abs(value), 1e-3 * scale)).all()
+        assert (
+            np.abs(weight * pdf - value)
+            <= tolerance("sample.weight.max") * np.maximum(np.abs(value), 1e-3 * scale)
+        ).all()
         np.testing.assert_array_equal(np.array(both[0]), value)
         np.testing.assert_array_equal(np.array(both[1]), pdf)
         assert (np.array(bs.wo)[2] > 0).all()
@@ -153,7 +165,11 @@ def test_lambertian_is_sampled_as_by_cosine(llvm, tmp_path):
     save(methods()["raw"].fit(replace(btf, values=values.astype(np.float16))), tmp_path / "flat.raw.exr")
     bsdf = load(mi, tmp_path / "flat.raw.exr")
     w, _ = grid(32, 64)
-    pdf = np.array(bsdf.pdf(mi.BSDFContext(), interaction(mi, len(w), (0.4, 0.4), unit((0.3, 0.1, 0.9))), mi.Vector3f(w.T)))
+    pdf = np.array(
+        bsdf.pdf(
+            mi.BSDFContext(), interaction(mi, len(w), (0.4, 0.4), unit((0.3, 0.1, 0.9))), mi.Vector3f(w.T)
+        )
+    )
     np.testing.assert_allclose(pdf, w[:, 2] / np.pi, rtol=tolerance("sample.lambert.max"))
 
 
@@ -167,7 +183,9 @@ def test_a_wrong_density_is_caught(paths, llvm, tmp_path, monkeypatch):
     test = mi.chi2.ChiSquareTest(
         domain=mi.chi2.SphericalDomain(),
         sample_func=lambda s: (
-            bsdf.sample(context, interaction(mi, dr.width(s), UVS[0], unit((0, 0, 1))), s[0], mi.Point2f(s[1], s[2]))[0].wo,
+            bsdf.sample(
+                context, interaction(mi, dr.width(s), UVS[0], unit((0, 0, 1))), s[0], mi.Point2f(s[1], s[2])
+            )[0].wo,
             mi.Float(1),
         ),
         pdf_func=lambda w: bsdf.pdf(context, interaction(mi, dr.width(w), UVS[0], unit((0.3, 0, 1))), w),
