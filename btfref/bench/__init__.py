@@ -1,0 +1,9 @@
+"""Run time against error: suites of benchmarks, each a function that returns its raw times and its summary."""
+
+from __future__ import annotations
+
+#: Suites by name: module with ``run(*, quick=False, progress=None) -> dict`` and ``table(result) -> rows``.
+SUITES = {
+    "fit": "btfref.bench.fit",
+    "render": "btfref.bench.render",
+}

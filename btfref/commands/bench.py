@@ -1,0 +1,46 @@
+"""Measure run time, and error beside it, of one suite of benchmarks.
+
+Times are medians of interleaved rounds after a warm-up; ratios are medians of paired rounds.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from btfref.bench import SUITES
+from btfref.commands._shared import Progress, emit, emit_json, output_file, table
+
+
+def add_arguments(parser):
+    """Describe the command's arguments."""
+    parser.add_argument("suite", choices=sorted(SUITES), help="what to measure")
+    parser.add_argument("--quick", action="store_true", help="fewer rounds")
+    parser.add_argument("--btf", metavar="BTF", help="a sampled BTF (.btf.zarr) instead of the suite's own")
+    parser.add_argument("-o", "--output", metavar="FILE.jsonl", help="append the raw result as one JSON line")
+    parser.add_argument("--json", action="store_true", help="print the raw result as JSON")
+
+
+def run(args):
+    """Carry the command out."""
+    import importlib
+    import json
+
+    out = output_file(args.output, ".jsonl") if args.output else None
+    suite = importlib.import_module(SUITES[args.suite])
+    options = {}
+    if args.btf:
+        from btfref.sampling import SampledBTF
+
+        options["btf"] = SampledBTF.load(args.btf, variance=False)
+    with Progress() as progress:
+        result = suite.run(quick=args.quick, progress=progress, **options)
+    if out:
+        with Path(out).open("a") as stream:
+            stream.write(json.dumps(result) + "\n")
+    if args.json:
+        emit_json(result)
+        return 0
+    header, rows = suite.table(result)
+    for line in table(rows, header=header):
+        emit(line)
+    return 0
