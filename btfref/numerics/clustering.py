@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from btfref.numerics.threads import one_blas_thread
+
 #: The iteration stops when the total error falls by less than this share.
 RELATIVE_PROGRESS = 1e-4
 MAXIMUM_ITERATIONS = 60
@@ -79,6 +81,11 @@ def local_pca(points, n_clusters, n_components, rng):
     labels : ndarray of int64, shape (n,)
     iterations : int
     """
+    with one_blas_thread():
+        return _local_pca(points, n_clusters, n_components, rng)
+
+
+def _local_pca(points, n_clusters, n_components, rng):
     n, dimension = points.shape
     n_used = min(n_clusters, n)
     rank = min(n_components, dimension)

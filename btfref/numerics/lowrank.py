@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from btfref.numerics.threads import one_blas_thread
+
 
 def texel_matrix(values):
     """Matrix of a sampled BTF with one texel per row.
@@ -17,12 +19,15 @@ def texel_matrix(values):
     ndarray of float32, shape (row * column, view * light * 3)
     """
     views, lights, rows, columns, channels = values.shape
-    table = values.reshape(views * lights, rows * columns, channels)
-    result = np.zeros((rows * columns, views * lights, channels), np.float32)
-    # Blocks of directions keep source and destination in cache.
-    for start in range(0, len(table), 64):
-        result[:, start : start + 64] = np.moveaxis(table[start : start + 64], 0, 1)
-    return result.reshape(rows * columns, -1)
+    # A texel's colour moves as one item: three times fewer, and larger, strided copies.
+    colour = np.dtype((np.void, channels * values.itemsize))
+    table = np.ascontiguousarray(values).reshape(views * lights, -1).view(colour)
+    result = np.zeros((rows * columns, views * lights * channels), np.float32)
+    # Blocks of texels keep source and destination in cache.
+    for start in range(0, rows * columns, 256):
+        block = np.ascontiguousarray(table[:, start : start + 256].T)
+        result[start : start + 256] = block.view(values.dtype).reshape(len(block), -1)
+    return result
 
 
 def range_basis(matrix, rank, rng, *, iterations=1):
@@ -50,39 +55,37 @@ def range_basis(matrix, rank, rng, *, iterations=1):
     sample = rng.standard_normal((width, n), dtype=np.float32) @ matrix
     for _ in range(iterations):
         # Orthonormalising on the short side between the products keeps float32 from losing small directions.
-        left = np.linalg.qr(matrix @ np.linalg.qr(sample.T)[0])[0]
-        sample = left.T @ matrix
-    basis = np.linalg.qr(sample.T)[0]
-    _, _, rotation = np.linalg.svd(matrix @ basis, full_matrices=False)
-    return rotation[:rank] @ basis.T
+        sample = _orthonormal(matrix @ _orthonormal(sample.T)).T @ matrix
+    basis = _orthonormal(sample.T)
+    projected = matrix @ basis
+    with one_blas_thread():
+        # The small Gram matrix in float64 keeps what float32 products resolve.
+        _, vectors = np.linalg.eigh(projected.T.astype(float) @ projected.astype(float))
+    return vectors[:, ::-1][:, :rank].T.astype(np.float32) @ basis.T
 
 
-def principal_rows(rows, rank):
-    """Leading right singular vectors of a small set of long rows, through the smaller Gram matrix.
+def _orthonormal(columns):
+    """Orthonormal columns that span the same space."""
+    with one_blas_thread():
+        return np.linalg.qr(columns)[0]
+
+
+def principal_rows(rows, rank, rng):
+    """Leading right singular vectors, padded with zero rows where ``rows`` has a lower rank.
 
     Parameters
     ----------
-    rows : ndarray, shape (n, d)
+    rows : ndarray of float32, shape (n, d)
     rank : int
+    rng : numpy.random.Generator
 
     Returns
     -------
     ndarray of float32, shape (rank, d)
-        Orthonormal; zero rows where ``rows`` has a lower rank.
+        Orthonormal but for the zero rows.
     """
-    n, d = rows.shape
-    result = np.zeros((rank, d), np.float32)
-    if n <= d:
-        gram = (rows @ rows.T).astype(np.float64)
-        value, vector = np.linalg.eigh(gram)
-        value, vector = value[::-1][:rank], vector[:, ::-1][:, :rank]
-        # Relative to the largest, float32 products carry nothing below this.
-        keep = value > max(value[0], 0) * 1e-6 if len(value) else value > 0
-        basis = vector[:, keep].T.astype(np.float32) @ rows
-        result[: len(basis)] = basis / np.linalg.norm(basis, axis=1, keepdims=True)
-    else:
-        value, vector = np.linalg.eigh((rows.T @ rows).astype(np.float64))
-        value, vector = value[::-1][:rank], vector[:, ::-1][:, :rank]
-        keep = value > max(value[0], 0) * 1e-6
-        result[: keep.sum()] = vector[:, keep].T
-    return result
+    basis = range_basis(rows, rank, rng, iterations=2)
+    energy = ((rows @ basis.T).astype(float) ** 2).sum(0)
+    # Relative to the largest, float32 products carry nothing below this.
+    basis[energy <= 1e-7 * energy.max(initial=0)] = 0
+    return np.pad(basis, [(0, rank - len(basis)), (0, 0)])

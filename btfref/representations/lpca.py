@@ -15,6 +15,7 @@ import numpy as np
 from btfref import conventions
 from btfref.numerics.clustering import local_pca
 from btfref.numerics.lowrank import principal_rows, range_basis, texel_matrix
+from btfref.numerics.threads import one_blas_thread
 from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
     base_meta,
@@ -140,7 +141,8 @@ def fit(btf, *, seed=0, progress=None, clusters=16, components=4, storage="half"
     energy = float(np.einsum("ij,ij->", matrix, matrix, dtype=np.float64))
     report(2, steps, "clustering")
     labels, iterations = local_pca(coordinates, clusters, components, rng)
-    means, axes, weights, error = _cluster_bases(matrix, labels, clusters, components, report)
+    with one_blas_thread():
+        means, axes, weights, error = _cluster_bases(matrix, labels, clusters, components, rng, report)
     # Axes are stored with unit peak: half floats then spend their range on the shape, weights on the amount.
     peak = np.maximum(np.abs(axes).max(-1), np.finfo(np.float32).tiny)
     weights = weights * peak[labels]
@@ -164,7 +166,7 @@ def fit(btf, *, seed=0, progress=None, clusters=16, components=4, storage="half"
     return Representation(maps | direction_arrays(btf.views, btf.lights), meta)
 
 
-def _cluster_bases(matrix, labels, clusters, components, report):
+def _cluster_bases(matrix, labels, clusters, components, rng, report):
     """Mean, axes and weights of each cluster from full vectors, and the squared error left."""
     n, d = matrix.shape
     means, axes = np.zeros((clusters, d), np.float32), np.zeros((clusters, components, d), np.float32)
@@ -178,7 +180,7 @@ def _cluster_bases(matrix, labels, clusters, components, report):
         block = matrix[members]
         means[k] = block.mean(0, dtype=np.float64)
         block -= means[k]
-        axes[k] = principal_rows(block, components)
+        axes[k] = principal_rows(block, components, rng)
         weights[members] = block @ axes[k].T
         error += float(np.einsum("ij,ij->", block, block, dtype=np.float64))
         error -= float((weights[members].astype(float) ** 2).sum())
