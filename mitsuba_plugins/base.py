@@ -13,6 +13,7 @@ import numpy as np
 
 from btfref.conventions import FILTER_TYPES
 from btfref.errors import InputError
+from btfref.numerics.frames import nearest_rotation
 from btfref.registry import method
 from mitsuba_plugins.guide import LightGuide
 from mitsuba_plugins.lookup import direction_table, tensor, valid_directions
@@ -69,9 +70,7 @@ def uv_transform(matrix):
         raise InputError(
             "the transform mirrors or is singular", field="to_uv", expected="a positive determinant"
         )
-    c, s = float(affine[0, 0] + affine[1, 1]), float(affine[1, 0] - affine[0, 1])
-    length = float(np.hypot(c, s))
-    return affine, ((c / length, s / length) if length > 0 else (1.0, 0.0))
+    return affine, nearest_rotation(affine[:, :2])
 
 
 def make_bsdf():

@@ -25,3 +25,24 @@ def shading_frame(normal, dp_du):
     s = dp_du - normal * (normal * dp_du).sum(-1, keepdims=True)
     s = s / np.linalg.norm(s, axis=-1, keepdims=True)
     return np.stack([s, np.cross(normal, s), normal], -2)
+
+
+def nearest_rotation(linear):
+    """The rotation nearest to a linear map of texture coordinates (its polar factor).
+
+    By this angle local directions turn about the normal to reach the frame of a transformed texture.
+
+    Parameters
+    ----------
+    linear : array_like, shape (2, 2)
+        With a positive determinant.
+
+    Returns
+    -------
+    tuple of float
+        Cosine and sine of the angle.
+    """
+    (a, b), (c, d) = np.asarray(linear, float).tolist()
+    cosine, sine = a + d, c - b
+    length = float(np.hypot(cosine, sine))
+    return (cosine / length, sine / length) if length > 0 else (1.0, 0.0)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from btfref.errors import InputError
+from btfref.numerics.frames import nearest_rotation
 
 #: Segments of a full turn of a tessellated sphere, disk or cylinder: chords lie within 4e-5 radii of the
 #: surface.
@@ -40,13 +41,8 @@ class BtfMaterial:
 
     @property
     def rotation(self):
-        """Cosine and sine of the turn about the normal that takes local directions to the texture's frame.
-
-        The rotation nearest to the linear part of ``to_uv``, as in the plugin ``btf``.
-        """
-        c, s = self.to_uv[0, 0] + self.to_uv[1, 1], self.to_uv[1, 0] - self.to_uv[0, 1]
-        length = np.hypot(c, s)
-        return (float(c / length), float(s / length)) if length > 0 else (1.0, 0.0)
+        """Cosine and sine of the turn about the normal that takes local directions to the texture's frame."""
+        return nearest_rotation(self.to_uv[:, :2])
 
 
 @dataclass(frozen=True)
