@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-#: Suites by name: module with ``run(*, quick=False, progress=None) -> dict`` and ``table(result) -> rows``.
+#: Suites by name: module with ``run(*, quick, progress, btf, only) -> dict`` and ``table(result) -> rows``.
 SUITES = {
     "fit": "btfref.bench.fit",
     "render": "btfref.bench.render",

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from btfref.bench.timing import interleaved, machine, summary
+from btfref.errors import InputError
 
 BASELINE = "scikit-learn KMeans + PCA"
 CLUSTERS, COMPONENTS = 16, 4
 
 
-def run(*, quick=False, progress=None, btf=None):
+def run(*, quick=False, progress=None, btf=None, only=None):
     """Time and error of ``lpca`` and of its peer.
 
     Parameters
@@ -20,6 +21,8 @@ def run(*, quick=False, progress=None, btf=None):
     progress : callable, optional
     btf : SampledBTF, optional
         Default: a checker of 64² texels and 81² directions at 8 samples.
+    only : iterable of str, optional
+        Must hold "lpca", the one method with a peer here.
 
     Returns
     -------
@@ -31,6 +34,8 @@ def run(*, quick=False, progress=None, btf=None):
     from btfref.numerics.lowrank import texel_matrix
     from btfref.representations import lpca
 
+    if only and "lpca" not in only:
+        raise InputError("nothing to measure", field="--only", got=", ".join(only), expected="lpca")
     btf = btf or checker(spp=8, progress=progress)
     matrix = texel_matrix(btf.values)
     errors = {}

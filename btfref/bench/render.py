@@ -13,7 +13,7 @@ BASELINE = "principled + bitmap"
 SAMPLES, SIZE = 16, 512
 
 
-def run(*, quick=False, progress=None, btf=None):
+def run(*, quick=False, progress=None, btf=None, only=None):
     """Time of a path-traced image with each texture filter, relative to ``principled`` with a bitmap.
 
     Parameters
@@ -23,6 +23,8 @@ def run(*, quick=False, progress=None, btf=None):
     progress : callable, optional
     btf : SampledBTF, optional
         Default: a checker of 64² texels and 81² directions at 2 samples (noise does not change the time).
+    only : iterable of str, optional
+        Keys of the methods to measure; default all.
 
     Returns
     -------
@@ -36,7 +38,7 @@ def run(*, quick=False, progress=None, btf=None):
     import mitsuba as mi
 
     from btfref.bench.data import checker
-    from btfref.registry import methods
+    from btfref.registry import method, methods
     from btfref.representations import save
 
     btf = btf or checker(progress=progress)
@@ -45,10 +47,12 @@ def run(*, quick=False, progress=None, btf=None):
 
     mitsuba_plugins.register()
     rounds = 5 if quick else 9
+    report = progress or (lambda *_: None)
     raw, result = {}, {}
     with tempfile.TemporaryDirectory() as folder:
         materials = {BASELINE: _principled(mi, btf)}
-        for key, row in methods().items():
+        for key in only or methods():
+            row = method(key)
             path = Path(folder) / f"checker.{key}.exr"
             save(row.fit(btf), path)
             for filter_type in ("nearest", "bilinear"):
@@ -58,7 +62,9 @@ def run(*, quick=False, progress=None, btf=None):
                     "filter_type": filter_type,
                     "to_uv": mi.ScalarTransform4f().scale([4, 4, 1]),
                 }
-        for name, scene in _scenes(mi).items():
+        scenes = _scenes(mi)
+        for i, (name, scene) in enumerate(scenes.items()):
+            report(i, len(scenes), name)
             tasks = {}
             for material, bsdf in materials.items():
                 loaded = mi.load_dict(_with_material(scene, bsdf))

@@ -16,6 +16,7 @@ def add_arguments(parser):
     parser.add_argument("suite", choices=sorted(SUITES), help="what to measure")
     parser.add_argument("--quick", action="store_true", help="fewer rounds")
     parser.add_argument("--btf", metavar="BTF", help="a sampled BTF (.btf.zarr) instead of the suite's own")
+    parser.add_argument("--only", metavar="METHOD[,METHOD]", help="these methods instead of all")
     parser.add_argument("-o", "--output", metavar="FILE.jsonl", help="append the raw result as one JSON line")
     parser.add_argument("--json", action="store_true", help="print the raw result as JSON")
 
@@ -27,7 +28,7 @@ def run(args):
 
     out = output_file(args.output, ".jsonl") if args.output else None
     suite = importlib.import_module(SUITES[args.suite])
-    options = {}
+    options = {"only": args.only.split(",")} if args.only else {}
     if args.btf:
         from btfref.sampling import SampledBTF
 

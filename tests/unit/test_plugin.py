@@ -1,0 +1,195 @@
+"""The plugin ``btf`` inside Mitsuba: registration, parameters, gradients, two sides, transforms."""
+
+import numpy as np
+import pytest
+from oracle import oracle_btf
+from probes import hemisphere, probe_points
+
+from btfref.compare.tolerances import tolerance
+from btfref.errors import InputError
+from btfref.registry import method, methods
+from btfref.representations import load, save
+
+
+@pytest.fixture(scope="module")
+def btf():
+    return oracle_btf((8, 6))
+
+
+@pytest.fixture(scope="module")
+def paths(btf, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("plugin")
+    result = {key: folder / f"oracle.{key}.exr" for key in methods()}
+    for key, path in result.items():
+        save(method(key).fit(btf), path)
+    return result
+
+
+def bsdf(mi, path, **parameters):
+    import mitsuba_plugins
+
+    mitsuba_plugins.register()
+    return mi.load_dict({"type": "btf", "filename": str(path), **parameters})
+
+
+def interaction(mi, uv, w_view):
+    import drjit as dr
+
+    si = dr.zeros(mi.SurfaceInteraction3f, len(w_view))
+    si.uv, si.wi = mi.Point2f(np.asarray(uv).T), mi.Vector3f(np.asarray(w_view).T)
+    return si
+
+
+def value(mi, plugin, uv, w_light, w_view, mode=None):
+    context = mi.BSDFContext() if mode is None else mi.BSDFContext(mode)
+    return np.array(plugin.eval(context, interaction(mi, uv, w_view), mi.Vector3f(np.asarray(w_light).T))).T
+
+
+def test_registers_again_after_a_variant_change(paths, llvm):
+    import mitsuba_plugins
+
+    mi = llvm
+    first = bsdf(mi, paths["lpca"])
+    mi.set_variant("scalar_rgb")
+    mi.set_variant("llvm_ad_rgb")
+    mitsuba_plugins.register()
+    second = bsdf(mi, paths["lpca"])
+    assert str(first) == str(second)
+    assert "method=lpca" in str(second)
+
+
+@pytest.mark.parametrize(
+    "variant", ["scalar_rgb", "llvm_ad_spectral", "llvm_ad_mono", "llvm_ad_mono_polarized"]
+)
+def test_other_variants_are_refused(variant, need):
+    need("llvm")
+    import mitsuba as mi
+
+    import mitsuba_plugins
+
+    mi.set_variant(variant)
+    with pytest.raises(InputError, match="RGB variant"):
+        mitsuba_plugins.register()
+
+
+@pytest.mark.parametrize(
+    ("parameters", "field"),
+    [
+        ({"filter_type": "cubic"}, "filter_type"),
+        ({"scale": -1.0}, "scale"),
+        ({"scale": float("nan")}, "scale"),
+        ({"sampling": "none"}, "sampling"),
+    ],
+)
+def test_bad_parameters_name_the_field(paths, llvm, parameters, field):
+    with pytest.raises(RuntimeError, match=f"field '{field}'"):
+        bsdf(llvm, paths["raw"], **parameters)
+
+
+def test_mirroring_transforms_are_refused(paths, llvm):
+    with pytest.raises(RuntimeError, match="mirrors"):
+        bsdf(llvm, paths["raw"], to_uv=llvm.ScalarTransform4f().scale([-1, 1, 1]))
+
+
+def test_scale_and_transform(paths, llvm, btf, rng):
+    """``scale`` multiplies; ``to_uv`` moves the texture, and its rotation turns the local frame."""
+    mi = llvm
+    representation = load(paths["raw"])
+    uv, w_light, w_view = probe_points(rng, 2000, btf.views, btf.lights)
+    uv = np.mod(uv, 1).astype(np.float32)
+    transform = mi.ScalarTransform4f().translate([0.3, 0.1, 0]).rotate([0, 0, 1], 30).scale([2, 2, 1])
+    got = value(mi, bsdf(mi, paths["raw"], scale=2.5, to_uv=transform), uv, w_light, w_view)
+    angle = np.radians(30)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+    def turned(w):
+        return np.concatenate([w[:, :2] @ turn.T, w[:, 2:]], 1)
+
+    expected = 2.5 * representation.evaluate(2 * uv @ turn.T + [0.3, 0.1], turned(w_light), turned(w_view))
+    scale = expected.max()
+    assert np.abs(got - expected).max() <= tolerance("plugin.transform.max") * scale
+
+
+def test_importance_transport_swaps_the_roles(paths, llvm, rng):
+    mi = llvm
+    plugin = bsdf(mi, paths["lpca"])
+    a, b = hemisphere(rng, 500), hemisphere(rng, 500)
+    uv = rng.random((500, 2))
+    radiance = value(mi, plugin, uv, a, b)
+    importance = value(mi, plugin, uv, b, a, mi.TransportMode.Importance)
+    np.testing.assert_allclose(radiance, importance, atol=tolerance("plugin.transform.max") * radiance.max())
+    assert np.abs(radiance - value(mi, plugin, uv, b, a)).max() > 0.01 * radiance.max()
+
+
+def test_twosided_mirrors(paths, llvm, rng):
+    mi = llvm
+    plugin = bsdf(mi, paths["raw"])
+    both = mi.load_dict({"type": "twosided", "bsdf": plugin})
+    a, b, uv = hemisphere(rng, 500), hemisphere(rng, 500), rng.random((500, 2))
+    np.testing.assert_array_equal(value(mi, both, uv, a, b), value(mi, plugin, uv, a, b))
+    below = [1, 1, -1]
+    np.testing.assert_array_equal(value(mi, both, uv, a * below, b * below), value(mi, plugin, uv, a, b))
+
+
+@pytest.mark.parametrize("key", methods())
+def test_maps_are_differentiable(key, paths, llvm, rng):
+    """The gradient of the mean value with respect to a map equals the difference quotient along a random direction."""
+    import drjit as dr
+
+    mi = llvm
+    plugin = bsdf(mi, paths[key])
+    parameters = mi.traverse(plugin)
+    names = [
+        n
+        for n, p in parameters
+        if (isinstance(p, (mi.TensorXf, mi.TensorXf16)) and parameters.flags(n) == 1)
+        or n in ("values", "basis")
+    ]
+    name = next(n for n in ("values", "basis", *names) if n in parameters)
+    uv, w_light, w_view = rng.random((256, 2)), hemisphere(rng, 256), hemisphere(rng, 256)
+    si, wo = interaction(mi, uv, w_view), mi.Vector3f(w_light.T)
+    start = mi.TensorXf(parameters[name])
+    step = mi.TensorXf(rng.normal(size=start.shape).astype(np.float32))
+
+    def mean(t):
+        parameters[name] = start + t * step
+        parameters.update()
+        return dr.mean(dr.mean(plugin.eval(mi.BSDFContext(), si, wo)))
+
+    t = mi.Float(0)
+    dr.enable_grad(t)
+    loss = mean(t)
+    dr.forward(t)
+    slope = dr.grad(loss)[0]
+    difference = (mean(mi.Float(0.05))[0] - mean(mi.Float(-0.05))[0]) / 0.1
+    assert abs(slope - difference) <= tolerance("plugin.gradient.max") * abs(difference)
+
+
+def test_renders_in_symbolic_mode(paths, llvm):
+    """A path-traced picture with loops and calls recorded, and the same one in evaluated mode."""
+    import drjit as dr
+
+    mi = llvm
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 3},
+            "sensor": {
+                "type": "perspective",
+                "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}},
+            },
+            "shape": {"type": "sphere", "bsdf": {"type": "twosided", "bsdf": bsdf(mi, paths["lpca"])}},
+            "other": {"type": "rectangle", "bsdf": bsdf(mi, paths["svd"])},
+            "light": {"type": "constant"},
+        }
+    )
+    pictures = []
+    for symbolic in (True, False):
+        with (
+            dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, symbolic),
+            dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, symbolic),
+        ):
+            pictures.append(np.array(mi.render(scene, spp=8, seed=0)))
+    assert pictures[0].max() > 0.1
+    np.testing.assert_allclose(*pictures, atol=tolerance("plugin.transform.max"))
