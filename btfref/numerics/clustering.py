@@ -109,9 +109,18 @@ def _local_pca(points, n_clusters, n_components, rng):
     return best, iteration
 
 
+def leading_axes(points, rank):
+    """Leading principal directions about the mean, shape (n, r) -> (min(rank, r), r); zero rows without variance."""
+    centred = points - points.mean(0)
+    value, vector = np.linalg.eigh(centred.T @ centred)
+    axes = vector[:, ::-1][:, :rank]
+    # Directions without variance are no axes: a single member must not span anything.
+    return (axes * (value[::-1][: axes.shape[1]] > 1e-12 * max(value[-1], 1e-300))).T
+
+
 def reconstruction_errors(points, labels, n_clusters, rank):
     """Squared error of every point in every cluster's affine subspace, shape (n, n_clusters)."""
-    n, dimension = points.shape
+    n = len(points)
     squared = (points**2).sum(1)
     error = np.full((n, n_clusters), np.inf)
     for k in range(n_clusters):
@@ -119,11 +128,7 @@ def reconstruction_errors(points, labels, n_clusters, rank):
         if not len(members):
             continue
         mean = members.mean(0)
-        centred = members - mean
-        value, vector = np.linalg.eigh(centred.T @ centred)
-        axes = vector[:, ::-1][:, : min(rank, dimension)]
-        # Directions without variance are no axes: a single member must not span anything.
-        axes = axes * (value[::-1][: axes.shape[1]] > 1e-12 * max(value[-1], 1e-300))
+        axes = leading_axes(members, rank).T
         projection = points @ axes - mean @ axes
         error[:, k] = squared - 2 * points @ mean + mean @ mean - (projection**2).sum(1)
     return np.maximum(error, 0)

@@ -46,8 +46,10 @@ def range_basis(matrix, rank, rng, *, iterations=1):
 
     Returns
     -------
-    ndarray of float32, shape (rank, d)
+    basis : ndarray of float32, shape (rank, d)
         Rows sorted by decreasing energy.
+    coordinates : ndarray of float32, shape (n, rank)
+        ``matrix @ basis.T``.
     """
     n, d = matrix.shape
     rank = min(rank, n, d)
@@ -56,36 +58,43 @@ def range_basis(matrix, rank, rng, *, iterations=1):
     for _ in range(iterations):
         # Orthonormalising on the short side between the products keeps float32 from losing small directions.
         sample = _orthonormal(matrix @ _orthonormal(sample.T)).T @ matrix
-    basis = _orthonormal(sample.T)
-    projected = matrix @ basis
+    return _rotated(matrix, _orthonormal(sample.T), rank)
+
+
+def refined_basis(matrix, basis):
+    """A basis near the dominant row space, after one step of subspace iteration.
+
+    Parameters
+    ----------
+    matrix : ndarray of float32, shape (n, d)
+    basis : ndarray of float32, shape (rank, d)
+        Approximately spans the dominant row space.
+
+    Returns
+    -------
+    basis, coordinates
+        As :func:`range_basis`, of rank at most ``min(rank, n)``; zero rows where ``matrix`` has a lower rank.
+    """
+    rank = min(len(basis), *matrix.shape)
+    sample = _orthonormal(matrix @ basis.T)[:, :rank].T @ matrix
+    basis, coordinates = _rotated(matrix, _orthonormal(sample.T), rank)
+    energy = (coordinates.astype(float) ** 2).sum(0)
+    # Relative to the largest, float32 products carry nothing below this.
+    keep = energy > 1e-7 * energy.max(initial=0)
+    return basis * keep[:, None], coordinates * keep
+
+
+def _rotated(matrix, columns, rank):
+    """The leading principal directions within the span of orthonormal columns, and the coordinates along them."""
+    projected = matrix @ columns
     with one_blas_thread():
         # The small Gram matrix in float64 keeps what float32 products resolve.
         _, vectors = np.linalg.eigh(projected.T.astype(float) @ projected.astype(float))
-    return vectors[:, ::-1][:, :rank].T.astype(np.float32) @ basis.T
+    vectors = vectors[:, ::-1][:, :rank].astype(np.float32)
+    return vectors.T @ columns.T, projected @ vectors
 
 
 def _orthonormal(columns):
     """Orthonormal columns that span the same space."""
     with one_blas_thread():
         return np.linalg.qr(columns)[0]
-
-
-def principal_rows(rows, rank, rng):
-    """Leading right singular vectors, padded with zero rows where ``rows`` has a lower rank.
-
-    Parameters
-    ----------
-    rows : ndarray of float32, shape (n, d)
-    rank : int
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    ndarray of float32, shape (rank, d)
-        Orthonormal but for the zero rows.
-    """
-    basis = range_basis(rows, rank, rng, iterations=2)
-    energy = ((rows @ basis.T).astype(float) ** 2).sum(0)
-    # Relative to the largest, float32 products carry nothing below this.
-    basis[energy <= 1e-7 * energy.max(initial=0)] = 0
-    return np.pad(basis, [(0, rank - len(basis)), (0, 0)])

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from btfref import conventions
-from btfref.numerics.clustering import local_pca
-from btfref.numerics.lowrank import principal_rows, range_basis, texel_matrix
+from btfref.numerics.clustering import leading_axes, local_pca
+from btfref.numerics.lowrank import range_basis, refined_basis, texel_matrix
 from btfref.numerics.threads import one_blas_thread
 from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
@@ -32,6 +32,9 @@ PRESETS = {"paper": {"clusters": 16, "components": 4, "storage": "float"}}
 #: Dimension of the global subspace in which texels are clustered. The share of energy outside of it is recorded;
 #: it bounds what clustering there can lose. The clusters' bases themselves come from the full vectors.
 SUBSPACE_RANK = 64
+
+#: Additional axes that take part in the step of subspace iteration, so that the kept ones converge.
+OVERSAMPLING = 4
 
 
 @dataclass(frozen=True)
@@ -131,18 +134,20 @@ def fit(btf, *, seed=0, progress=None, clusters=16, components=4, storage="half"
     """
     clusters, components = positive_integer("clusters", clusters), positive_integer("components", components)
     report = progress or (lambda *_: None)
-    steps = 3 + clusters
     rng = np.random.default_rng(seed)
     rows, columns = btf.values.shape[2:4]
     matrix = texel_matrix(btf.values)
-    report(1, steps, "global PCA")
-    basis = range_basis(matrix, max(SUBSPACE_RANK, 2 * components), rng)
-    coordinates = (matrix @ basis.T).astype(float)
-    energy = float(np.einsum("ij,ij->", matrix, matrix, dtype=np.float64))
-    report(2, steps, "clustering")
+    report(0, 3, "global PCA")
+    subspace, coordinates = range_basis(matrix, max(SUBSPACE_RANK, 2 * components), rng)
+    coordinates = coordinates.astype(float)
+    squares = np.einsum("ij,ij->i", matrix, matrix).astype(float)
+    energy = float(squares.sum())
+    report(1, 3, "clustering")
     labels, iterations = local_pca(coordinates, clusters, components, rng)
-    with one_blas_thread():
-        means, axes, weights, error = _cluster_bases(matrix, labels, clusters, components, rng, report)
+    report(2, 3, "cluster bases")
+    means, axes, weights, error = _cluster_bases(
+        matrix, squares, subspace, coordinates, labels, clusters, components
+    )
     # Axes are stored with unit peak: half floats then spend their range on the shape, weights on the amount.
     peak = np.maximum(np.abs(axes).max(-1), np.finfo(np.float32).tiny)
     weights = weights * peak[labels]
@@ -166,22 +171,27 @@ def fit(btf, *, seed=0, progress=None, clusters=16, components=4, storage="half"
     return Representation(maps | direction_arrays(btf.views, btf.lights), meta)
 
 
-def _cluster_bases(matrix, labels, clusters, components, rng, report):
-    """Mean, axes and weights of each cluster from full vectors, and the squared error left."""
+def _cluster_bases(matrix, squares, subspace, coordinates, labels, clusters, components):
+    """Mean, axes and weights of each cluster from full vectors, and the squared error left.
+
+    The clusters' axes within the subspace are the start of one step of subspace iteration on the full vectors.
+    """
     n, d = matrix.shape
     means, axes = np.zeros((clusters, d), np.float32), np.zeros((clusters, components, d), np.float32)
     weights = np.zeros((n, components), np.float32)
     error = 0.0
-    for k in range(clusters):
-        report(3 + k, 3 + clusters, "cluster bases")
-        members = np.flatnonzero(labels == k)
+    groups = [np.flatnonzero(labels == k) for k in range(clusters)]
+    with one_blas_thread():
+        starts = [leading_axes(coordinates[m], components + OVERSAMPLING) if len(m) else None for m in groups]
+    for k, members in enumerate(groups):
         if not len(members):
             continue
         block = matrix[members]
-        means[k] = block.mean(0, dtype=np.float64)
+        means[k] = block.mean(0)
         block -= means[k]
-        axes[k] = principal_rows(block, components, rng)
-        weights[members] = block @ axes[k].T
-        error += float(np.einsum("ij,ij->", block, block, dtype=np.float64))
+        basis, weight = refined_basis(block, starts[k].astype(np.float32) @ subspace)
+        rank = min(components, len(basis))
+        axes[k, :rank], weights[members, :rank] = basis[:rank], weight[:, :rank]
+        error += squares[members].sum() - len(members) * float(means[k].astype(float) @ means[k])
         error -= float((weights[members].astype(float) ** 2).sum())
     return means, axes, weights, max(error, 0.0)

@@ -103,8 +103,7 @@ def fit(btf, *, seed=0, progress=None, components=16, storage="half", filter_typ
     rows, columns = btf.values.shape[2:4]
     matrix = texel_matrix(btf.values)
     report(1, 2, "singular vectors")
-    basis = range_basis(matrix, components, np.random.default_rng(seed))
-    weights = matrix @ basis.T
+    basis, weights = range_basis(matrix, components, np.random.default_rng(seed), iterations=2)
     energy = float(np.einsum("ij,ij->", matrix, matrix, dtype=np.float64))
     kept = float((weights.astype(float) ** 2).sum())
     peak = np.maximum(np.abs(basis).max(1), np.finfo(np.float32).tiny)

@@ -12,7 +12,7 @@ from btfref.compare.tolerances import tolerance
 from btfref.conventions import texel_stencil
 from btfref.errors import InputError
 from btfref.numerics.clustering import local_pca
-from btfref.numerics.lowrank import principal_rows, range_basis, texel_matrix
+from btfref.numerics.lowrank import range_basis, refined_basis, texel_matrix
 from btfref.registry import method, methods
 from btfref.representations import load, read_info, save
 from btfref.representations.container import payload_bytes
@@ -171,17 +171,21 @@ def test_range_basis_spans_the_leading_space(rng):
     left, right = np.linalg.qr(rng.normal(size=(80, 30)))[0], np.linalg.qr(rng.normal(size=(200, 30)))[0]
     values = 0.5 ** np.arange(30)
     matrix = ((left * values) @ right.T).astype(np.float32)
-    basis = range_basis(matrix, 6, rng, iterations=2)
+    basis, coordinates = range_basis(matrix, 6, rng, iterations=2)
+    np.testing.assert_allclose(coordinates, matrix @ basis.T, atol=tolerance("lowrank.basis.max"))
     np.testing.assert_allclose(
         np.abs(np.einsum("ij,ij->i", basis, right.T[:6])), 1, atol=tolerance("lowrank.basis.max")
     )
 
 
-def test_principal_rows_pad_a_low_rank(rng):
+def test_refined_basis_has_no_more_than_the_rank(rng):
     rows = (rng.normal(size=(9, 2)) @ rng.normal(size=(2, 40))).astype(np.float32)
-    basis = principal_rows(rows, 5, rng)
+    basis, coordinates = refined_basis(rows, np.linalg.qr(rng.normal(size=(40, 5)))[0].T.astype(np.float32))
     np.testing.assert_array_equal(basis[2:], 0)
     np.testing.assert_allclose(basis[:2] @ basis[:2].T, np.eye(2), atol=tolerance("lowrank.basis.max"))
+    np.testing.assert_allclose(
+        coordinates @ basis, rows, atol=tolerance("lowrank.basis.max") * np.abs(rows).max()
+    )
 
 
 def test_texel_matrix(btf):
