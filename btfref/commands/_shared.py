@@ -81,6 +81,17 @@ def count(minimum=1):
     return read
 
 
+def ranges(text):
+    """Whole numbers such as ``0,3,10-12`` as a tuple, for argparse's ``type=``."""
+    found = []
+    for item in text.split(","):
+        first, dash, last = item.partition("-")
+        if not first.isdecimal() or (dash and not last.isdecimal()):
+            raise ArgumentTypeError(f"got {text!r}, expected numbers and ranges such as 0,3,10-12")
+        found.extend(range(int(first), int(last if dash else first) + 1))
+    return tuple(found)
+
+
 def direction_set(text):
     """A direction set by name, or from a text file with one ``theta phi`` pair in degrees per line.
 

@@ -14,6 +14,7 @@ from btfref.commands._shared import (
     emit,
     emit_json,
     output_file,
+    ranges,
 )
 from btfref.errors import InputError
 
@@ -41,6 +42,16 @@ def add_arguments(parser):
     parser.add_argument(
         "--set", nargs="+", action="extend", metavar="KEY=VALUE", help="parameters of the mesostructure"
     )
+    parser.add_argument(
+        "--estimator",
+        choices=("path", "surface"),
+        default="path",
+        help="path: the reference; surface: visibility traced once for all views and lights (default path)",
+    )
+    for name in ("views", "lights", "tiles"):
+        parser.add_argument(
+            f"--only-{name}", type=ranges, metavar="I,J-K", help=f"fill these {name} now, the rest later"
+        )
     parser.add_argument("--overwrite", action="store_true", help="replace a store of other settings")
     parser.add_argument("--json", action="store_true", help="print the facts of the store as JSON")
 
@@ -57,21 +68,32 @@ def run(args):
         "seed": args.seed,
         "max_depth": args.max_depth,
         "dtype": args.dtype,
+        "estimator": args.estimator,
     }
     for key in parameters:
         if key in settings:
             option = f"--{key.replace('_', '-')}"
             raise InputError("not a parameter of the mesostructure", field="--set", got=key, expected=option)
 
+    from btfref.sampling.part import Part
     from btfref.sampling.synthesis import synthesize_store
+
+    only = Part(args.only_views, args.only_lights, args.only_tiles)
 
     with Progress() as progress:
         store = synthesize_store(
-            out, args.mesostructure, overwrite=args.overwrite, progress=progress, **settings, **parameters
+            out,
+            args.mesostructure,
+            overwrite=args.overwrite,
+            progress=progress,
+            only=only,
+            **settings,
+            **parameters,
         )
     info = store.info()
     if args.json:
         emit_json(info)
     else:
-        emit(f"{out}: {' × '.join(map(str, info['shape']))}, {bytes_text(info['file_bytes'])}")
+        there = "" if info["complete"] else f", {info['coverage']:.1%} of it there"
+        emit(f"{out}: {' × '.join(map(str, info['shape']))}, {bytes_text(info['file_bytes'])}{there}")
     return 0

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 
-def tile_group(mesostructure):
+def tile_group(mesostructure, bsdfs=None):
     """One tile as a Mitsuba shape group; set a JIT variant first.
 
     Parameters
     ----------
     mesostructure : Mesostructure
+    bsdfs : list of mitsuba.BSDF, optional
+        One per part; loaded from the parts when not given.
 
     Returns
     -------
@@ -22,7 +24,7 @@ def tile_group(mesostructure):
     group = {"type": "shapegroup"}
     for index, part in enumerate(mesostructure.parts):
         properties = mi.Properties()
-        properties["mesh_bsdf"] = mi.load_dict(part.bsdf)
+        properties["mesh_bsdf"] = mi.load_dict(part.bsdf) if bsdfs is None else bsdfs[index]
         mesh = mi.Mesh(
             f"{mesostructure.name}_{index}",
             len(part.vertices),
@@ -43,7 +45,7 @@ def tile_group(mesostructure):
     return mi.load_dict(group)
 
 
-def tiled_shapes(mesostructure, columns, rows, to_world=None):
+def tiled_shapes(mesostructure, columns, rows, to_world=None, bsdfs=None):
     """Copies of the tile as a dict of shapes for ``mi.load_dict``.
 
     Parameters
@@ -53,6 +55,8 @@ def tiled_shapes(mesostructure, columns, rows, to_world=None):
         Tile offsets along x and along y; every pair becomes an instance.
     to_world : mitsuba.ScalarTransform4f, optional
         From tile coordinates to the world.
+    bsdfs : list of mitsuba.BSDF, optional
+        One per part; loaded from the parts when not given.
 
     Returns
     -------
@@ -61,7 +65,7 @@ def tiled_shapes(mesostructure, columns, rows, to_world=None):
     import mitsuba as mi
 
     transform = mi.ScalarTransform4f() if to_world is None else to_world
-    shapes = {"tile": tile_group(mesostructure)}
+    shapes = {"tile": tile_group(mesostructure, bsdfs)}
     for j in rows:
         for i in columns:
             shapes[f"copy_{i}_{j}".replace("-", "m")] = {

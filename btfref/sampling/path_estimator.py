@@ -14,24 +14,16 @@ import math
 
 import numpy as np
 
+from btfref.sampling.tiled_scene import START, TiledScene, stream_keys, uniforms
+
 #: Memory (bytes) of the sample buffer of one pass; reduction needs about three times that.
 SAMPLE_BUFFER = 96 << 20
-
-#: Largest number of tiles on each side of the central one; beyond it rays are wrapped instead.
-MAXIMUM_REACH = 4
-
-#: Crossings of the tiled patch after which a ray counts as escaped. A ray needs |d_z| below
-#: height / (MAXIMUM_ROUNDS · reach), i.e. under 1e-4 · height, and no hit on its way, to be concerned.
-MAXIMUM_ROUNDS = 10_000
 
 #: First vertex (1 = the visible one) at which Russian roulette may end a path.
 ROULETTE_VERTEX = 3
 
 #: Largest probability of survival.
 ROULETTE_LIMIT = 0.95
-
-#: Where a view ray starts, in tile units above the sampling plane along w_view.
-START = 0.125
 
 
 def strata(spp):
@@ -71,6 +63,12 @@ class PathEstimator:
     seed : int
     max_depth : int
         As in Mitsuba's path integrator: 2 is direct light only, −1 has no limit.
+    views : ndarray, shape (n_views, 3), optional
+        Needed for `all_views` only.
+    wanted : sequence of int, optional
+        Not used: views are independent of each other.
+    mask : ndarray (rows · columns,) bool, optional
+        Texels that are asked for; the others may be left 0.
 
     Notes
     -----
@@ -80,29 +78,18 @@ class PathEstimator:
 
     key = "path"
 
-    def __init__(self, mesostructure, lights, *, texels, spp, seed, max_depth):
+    def __init__(
+        self, mesostructure, lights, *, texels, spp, seed, max_depth, views=None, wanted=None, mask=None
+    ):
         import drjit as dr
         import mitsuba as mi
 
-        from btfref.mesostructure.tiling import tiled_shapes
-
         self.texels, self.spp, self.seed = tuple(texels), int(spp), int(seed)
-        self.max_depth = int(max_depth)
-        self.low, self.high = mesostructure.height
+        self.max_depth, self.views, self.mask = int(max_depth), views, mask
         lights = np.asarray(lights, dtype=np.float64)
         self.lit = np.flatnonzero(lights[:, 2] > 0)
         self.n_lights = len(lights)
-
-        # A shadow ray from the depth of the mesostructure to its top must not leave the patch, or it is
-        # wrapped.
-        z = lights[self.lit, 2] if len(self.lit) else np.ones(1)
-        across = -self.low * float((np.sqrt(1 - np.minimum(z, 1) ** 2) / z).max()) + mesostructure.overhang
-        self.reach = int(np.clip(math.ceil(across + START), 1, MAXIMUM_REACH))
-        self.wrap_shadows = across > self.reach
-        # Geometry that sticks out of its tile must be complete as far as any ray goes.
-        margin = self.reach + math.ceil(mesostructure.overhang)
-        offsets = range(-margin, margin + 1)
-        self.scene = mi.load_dict({"type": "scene", **tiled_shapes(mesostructure, offsets, offsets)})
+        self.tiles = TiledScene(mesostructure, lights)
         self.lights = mi.Float(lights[self.lit].astype(np.float32).ravel())
         dr.eval(self.lights)
         self._buffer = None
@@ -112,6 +99,11 @@ class PathEstimator:
         """Texels traced together; a bound on memory, without influence on the result."""
         lanes = max(SAMPLE_BUFFER // (12 * max(len(self.lit), 1)), 1)
         return max(1, min(self.texels[0] * self.texels[1], lanes // self.spp))
+
+    def all_views(self, views):
+        """Yield (view, mean, variance) of views, one after the other; see `view`."""
+        for index in views:
+            yield index, *self.view(index, self.views[index])
 
     def view(self, index, w_view):
         """Mean and variance of the mean for one view.
@@ -132,17 +124,19 @@ class PathEstimator:
         mean = np.zeros((self.n_lights, rows * columns, 3), np.float32)
         variance = np.zeros_like(mean)
         if w_view[2] > 0 and len(self.lit):
-            stream = np.random.SeedSequence([self.seed, int(index)]).generate_state(2, np.uint32)
+            keys = stream_keys(self.seed, int(index))
             step = self.texels_per_pass
             for first in range(0, rows * columns, step):
                 last = min(first + step, rows * columns)
-                part = self._texels(first, last - first, np.asarray(w_view, dtype=np.float64), stream)
+                if self.mask is not None and not self.mask[first:last].any():
+                    continue
+                part = self._texels(first, last - first, np.asarray(w_view, dtype=np.float64), keys)
                 # Advanced index beside a slice: (n_lit, texels, 3) on both sides.
                 mean[self.lit, first:last] = part[0]
                 variance[self.lit, first:last] = part[1]
         return mean.reshape(-1, rows, columns, 3), variance.reshape(-1, rows, columns, 3)
 
-    def _texels(self, first, n_texels, w_view, stream):
+    def _texels(self, first, n_texels, w_view, keys):
         """Statistics of texels first … first + n_texels − 1, as two (n_lit, n_texels, 3) arrays."""
         import drjit as dr
         import mitsuba as mi
@@ -151,7 +145,6 @@ class PathEstimator:
         if self._buffer is None or dr.width(self._buffer) != 3 * n_lit * n_lanes:
             # Touching new memory costs as much as filling it: one buffer serves all views.
             self._buffer = dr.zeros(mi.Float, 3 * n_lit * n_lanes)
-        keys = [dr.opaque(mi.UInt32, int(word)) for word in stream]
         # Everything that changes between views is opaque: one kernel then serves all of them.
         first = dr.opaque(mi.UInt32, first * self.spp)
         n_lanes_opaque = dr.opaque(mi.UInt32, n_lanes)
@@ -181,7 +174,7 @@ class PathEstimator:
         columns, rows, per_stratum = strata(self.spp)
         texel, sample = lane // self.spp, lane % self.spp
         stratum = sample // per_stratum
-        u, v, _, _ = _uniforms(lane, keys, mi.UInt32(0))
+        u, v, _, _ = uniforms(lane, keys, mi.UInt32(0))
         u = (mi.Float(stratum % columns) + u) / columns
         v = (mi.Float(stratum // columns) + v) / rows
         x = (mi.Float(texel % self.texels[1]) + u) / self.texels[1]
@@ -195,14 +188,14 @@ class PathEstimator:
 
         lane, origin, direction, throughput = state
         depth = dr.opaque(mi.UInt32, number)
-        interaction = self._intersect(origin, direction)
+        interaction = self.tiles.intersect(origin, direction)
         active = interaction.is_valid()
         bsdf = interaction.bsdf()
         context = mi.BSDFContext()
         self._connect(interaction, bsdf, context, throughput, lane, active, n_lanes, first_vertex=number == 1)
 
-        lobe, u, v, _ = _uniforms(lane + first, keys, 2 * depth)
-        roulette, _, _, _ = _uniforms(lane + first, keys, 2 * depth + 1)
+        lobe, u, v, _ = uniforms(lane + first, keys, 2 * depth)
+        roulette, _, _, _ = uniforms(lane + first, keys, 2 * depth + 1)
         sample, weight = bsdf.sample(context, interaction, lobe, mi.Point2f(u, v), active)
         throughput = throughput * weight
         survival = dr.minimum(dr.max(throughput), ROULETTE_LIMIT)
@@ -226,7 +219,7 @@ class PathEstimator:
             value = throughput * bsdf.eval(context, interaction, interaction.to_local(w_light), active)
             lit = active & (dr.max(value) > 0)
             ray = interaction.spawn_ray(w_light)
-            lit &= ~self._occluded(ray, lit)
+            lit &= ~self.tiles.occluded(ray, lit)
             index = dr.fma(i, 3 * n_lanes, lane)
             for channel in range(3):
                 at = index + channel * n_lanes
@@ -238,71 +231,6 @@ class PathEstimator:
             return (i + 1,)
 
         dr.while_loop((mi.UInt32(0) + dr.zeros(mi.UInt32, dr.width(lane)),), lambda i: i < n_lit, connect)
-
-    def _travel(self, direction):
-        """Distance along a ray from the central tile that surely stays in the patch."""
-        import drjit as dr
-
-        return dr.minimum(self.reach / dr.maximum(dr.abs(direction.x), dr.abs(direction.y)), 1e4)
-
-    def _wrapped(self, origin, direction, travel):
-        """The place at the patch's border, taken to the central tile, and whether the slab goes on there."""
-        import drjit as dr
-        import mitsuba as mi
-
-        end = dr.fma(direction, travel, origin)
-        inside = dr.select(direction.z <= 0, end.z >= self.low, end.z <= self.high)
-        return mi.Point3f(end.x - dr.floor(end.x), end.y - dr.floor(end.y), end.z), inside
-
-    def _intersect(self, origin, direction):
-        """First hit on the infinitely tiled surface, moved to the central tile."""
-        import drjit as dr
-        import mitsuba as mi
-
-        travel = self._travel(direction)
-        origin = mi.Point3f(origin.x - dr.floor(origin.x), origin.y - dr.floor(origin.y), origin.z)
-
-        def search(origin, hit, searching, rounds):
-            ray = mi.Ray3f(origin, direction)
-            ray.maxt = travel
-            hit = self.scene.ray_intersect_preliminary(ray, coherent=False, active=searching)
-            end, inside = self._wrapped(origin, direction, travel)
-            searching = searching & ~hit.is_valid() & inside & (rounds < MAXIMUM_ROUNDS)
-            origin = dr.select(searching, end, origin)
-            return origin, hit, searching, rounds + 1
-
-        hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(origin))
-        hit.t = dr.full(mi.Float, math.inf, dr.width(origin))
-        searching = dr.full(mi.Bool, True, dr.width(origin))
-        rounds = dr.zeros(mi.UInt32, dr.width(origin))
-        state = (origin, hit, searching, rounds)
-        origin, hit, _, _ = dr.while_loop(state, lambda origin, hit, searching, rounds: searching, search)
-        interaction = hit.compute_surface_interaction(
-            mi.Ray3f(origin, direction), mi.RayFlags.All, hit.is_valid()
-        )
-        p = interaction.p
-        interaction.p = mi.Point3f(p.x - dr.floor(p.x), p.y - dr.floor(p.y), p.z)
-        return interaction
-
-    def _occluded(self, ray, active):
-        """Whether the infinitely tiled surface blocks a ray that starts in the central tile."""
-        import drjit as dr
-        import mitsuba as mi
-
-        if not self.wrap_shadows:
-            return self.scene.ray_test(ray, coherent=True, active=active)
-        travel, direction = self._travel(ray.d), mi.Vector3f(ray.d)
-
-        def search(origin, blocked, searching, rounds):
-            part = mi.Ray3f(origin, direction)
-            part.maxt = travel
-            blocked = blocked | self.scene.ray_test(part, coherent=True, active=searching)
-            end, inside = self._wrapped(origin, direction, travel)
-            searching = searching & ~blocked & inside & (rounds < MAXIMUM_ROUNDS)
-            return dr.select(searching, end, origin), blocked, searching, rounds + 1
-
-        state = (mi.Point3f(ray.o), mi.Bool(False), mi.Bool(active), mi.UInt32(0))
-        return dr.while_loop(state, lambda origin, blocked, searching, rounds: searching, search)[1]
 
     def _statistics(self, n_lit, n_texels):
         """Mean and variance of the mean from the samples of the last pass."""
@@ -317,12 +245,3 @@ class PathEstimator:
         variance = spread / (n_strata**2 * per_stratum * (per_stratum - 1))
         shape = (n_lit, 3, n_texels)
         return tuple(value.numpy().reshape(shape).transpose(0, 2, 1) for value in (mean, variance))
-
-
-def _uniforms(lane, keys, dimension):
-    """Four numbers in [0, 1) per lane and dimension: counter-based, so that no state travels with a path."""
-    import mitsuba as mi
-
-    a, b = mi.sample_tea_32(lane ^ keys[0], keys[1], 6)
-    words = (*mi.sample_tea_32(a, b + 2 * dimension, 6), *mi.sample_tea_32(a, b + 2 * dimension + 1, 6))
-    return tuple(mi.Float(word >> 8) * 2.0**-24 for word in words)

@@ -169,6 +169,7 @@ class BTFStore:
             JSON types: kind, shape, directions, type, bytes, coverage, attributes.
         """
         rows, columns = self.texels
+        covered = self.coverage
         files = [entry for entry in self.path.rglob("*") if entry.is_file()]
         count = len(self.views) * len(self.lights) * rows * columns * 3
         return {
@@ -185,8 +186,13 @@ class BTFStore:
             "raw_bytes": 4 * count,
             "file_bytes": sum(entry.stat().st_size for entry in files),
             "ratio": 4 / self.dtype.itemsize,
-            "coverage": float(self.coverage.mean()),
-            "complete": self.complete,
+            "coverage": float(covered.mean()),
+            "coverage_of": {
+                "views": int(covered.any(axis=(1, 2, 3)).sum()),
+                "lights": int(covered.any(axis=(0, 2, 3)).sum()),
+                "tiles": f"{int(covered.any(axis=(0, 1)).sum())} of {covered[0, 0].size}",
+            },
+            "complete": bool(covered.all()),
             "has_variance": self.has_variance,
             "parameters": self.attributes.get("parameters", {}),
             "parent": self.attributes.get("parent", {}),
@@ -229,6 +235,43 @@ class BTFStore:
             check_finite(stored, self.path, field)
             self._guard(field, lambda target=target, stored=stored: target.__setitem__(int(view), stored))
         self._guard("coverage", lambda: self._coverage.__setitem__(int(view), 1))
+
+    def write_part(self, view, lights, tiles, values, variance=None):
+        """Store some tiles of some lights of one view; arguments and errors otherwise as of `write_view`.
+
+        Parameters
+        ----------
+        lights : ndarray of int
+        tiles : (ndarray, ndarray) of int
+            Rows and columns of the tiles.
+        values, variance : ndarray, shape (lights chosen, rows, columns, 3)
+            Of whole rows and columns; only the tiles are taken.
+        """
+        if (variance is not None) != self.has_variance:
+            raise InputError(
+                "variance of a view", file=self.path, expected="given" if self.has_variance else "none"
+            )
+        for field, array, target in (
+            ("values", values, self._values),
+            ("variance", variance, self._variance),
+        ):
+            if array is None:
+                continue
+            with np.errstate(over="ignore"):
+                stored = np.ascontiguousarray(array, dtype=target.dtype)
+            check_finite(stored, self.path, field)
+            # A view is one file, so it is read and written as a whole; what is not there is NaN.
+            whole = self._guard(field, lambda target=target: target[int(view)])
+            for row, column in zip(*tiles, strict=True):
+                place = tuple(
+                    slice(k * n, (k + 1) * n) for k, n in zip((row, column), self.tile, strict=True)
+                )
+                whole[lights, *place] = stored[:, *place]
+            self._guard(field, lambda target=target, whole=whole: target.__setitem__(int(view), whole))
+        marks = self._guard("coverage", lambda: self._coverage[int(view)])
+        for row, column in zip(*tiles, strict=True):
+            marks[lights, row, column] = 1
+        self._guard("coverage", lambda: self._coverage.__setitem__(int(view), marks))
 
     def read(self, *, views=None, lights=None, rows=None, columns=None, variance=True):
         """Read a part; only the chunks that hold it are touched.

@@ -13,16 +13,19 @@ from btfref.errors import InputError
 from btfref.mesostructure import build
 from btfref.numerics.directions import directions
 from btfref.sampling.layout import CONVENTIONS, TILE, check_finite, remove_leftovers, remove_store
+from btfref.sampling.part import Part
 from btfref.sampling.sampled_btf import SampledBTF
 from btfref.sampling.store import create_store, open_store
 from btfref.sampling.variant import mitsuba_variant
 from btfref.versions import versions
 
-#: name -> "module:class". An estimator is made from (mesostructure, light vectors, texels, spp, seed,
-#: max_depth) and gives ``view(index, w_view) -> mean, variance of the mean``, each (lights, rows, columns,
-#: 3) float32, from numbers that depend on the seed and the view's index only: any order and any subset of
-#: views gives the same bytes.
-ESTIMATORS = {"path": "btfref.sampling.path_estimator:PathEstimator"}
+#: name -> "module:class". An estimator is made from (mesostructure, light vectors, all view vectors, texels,
+#: spp, seed, max_depth, wanted views, mask of texels); ``all_views(views)`` yields (view, mean, variance of
+#: the mean), arrays (lights, rows, columns, 3) float32. Any order and any subset gives the same bytes.
+ESTIMATORS = {
+    "path": "btfref.sampling.path_estimator:PathEstimator",
+    "surface": "btfref.sampling.surface_estimator:SurfaceEstimator",
+}
 
 #: What a result depends on; recorded with it.
 VERSIONS = ("numpy", "mitsuba", "drjit")
@@ -71,7 +74,8 @@ def synthesize(
     progress : callable, optional
         Called as ``progress(done, total, label)`` after each view.
     estimator : str
-        "path".
+        "path", the reference, or "surface", which traces visibility once for all views and lights; see
+        `btfref.sampling.surface_estimator`. `spp` then counts surface points per texel of the tile.
     overwrite : bool
         Replace a store of other settings.
     variant : str
@@ -108,7 +112,7 @@ def synthesize(
     return SampledBTF(values, job.views, job.lights, variance, {**CONVENTIONS, **job.attributes})
 
 
-def synthesize_store(out, mesostructure="checker", *, overwrite=False, progress=None, **settings):
+def synthesize_store(out, mesostructure="checker", *, overwrite=False, progress=None, only=None, **settings):
     """As `synthesize` with ``out``, without reading the result into memory.
 
     Parameters
@@ -116,11 +120,13 @@ def synthesize_store(out, mesostructure="checker", *, overwrite=False, progress=
     out : path-like
     mesostructure, overwrite, progress, **settings
         As for `synthesize`.
+    only : Part, optional
+        What to fill now; the rest can be filled later, by the same call with another part.
 
     Returns
     -------
     BTFStore
-        Complete.
+        Complete, but for what `only` left out.
     """
     defaults = {
         "texels": 64,
@@ -134,7 +140,9 @@ def synthesize_store(out, mesostructure="checker", *, overwrite=False, progress=
         "variant": "llvm_ad_rgb",
     }
     chosen = {key: settings.pop(key, value) for key, value in defaults.items()}
-    return _Job(mesostructure, settings, **chosen).to_store(out, overwrite=overwrite, progress=progress)
+    return _Job(mesostructure, settings, **chosen).to_store(
+        out, overwrite=overwrite, progress=progress, only=only
+    )
 
 
 class _Job:
@@ -200,9 +208,12 @@ class _Job:
             "versions": versions(VERSIONS),
         }
 
-    def results(self, wanted, progress=None, done=0):
-        """Mean and variance of the wanted views, one after the other."""
-        wanted = list(wanted)
+    def results(self, wanted, progress=None, done=0, *, lights=None, mask=None):
+        """Mean and variance of the wanted views, one after the other.
+
+        `lights` and `mask` (of texels) restrict what is computed; the former also what comes back.
+        """
+        wanted = [int(view) for view in wanted]
         if not wanted:
             return
         module, _, name = ESTIMATORS[self.estimator].partition(":")
@@ -210,18 +221,21 @@ class _Job:
         with mitsuba_variant(self.variant):
             estimator = make(
                 self.mesostructure,
-                self.lights.vectors,
+                self.lights.vectors if lights is None else self.lights.vectors[lights],
+                views=self.views.vectors,
+                wanted=wanted,
+                mask=mask,
                 texels=self.texels,
                 spp=self.spp,
                 seed=self.seed,
                 max_depth=self.max_depth,
             )
-            for count, view in enumerate(wanted, 1):
-                yield view, *estimator.view(view, self.views.vectors[view])
+            for count, result in enumerate(estimator.all_views(wanted), 1):
+                yield result
                 if progress is not None:
                     progress(done + count, done + len(wanted), "synthesis")
 
-    def to_store(self, out, *, overwrite=False, progress=None):
+    def to_store(self, out, *, overwrite=False, progress=None, only=None):
         """Fill the store at ``out``, from where an earlier run of the same settings stopped."""
         out = Path(out)
         remove_leftovers(out)
@@ -237,10 +251,19 @@ class _Job:
                 dtype=self.dtype,
                 attributes=self.attributes,
             )
-        missing = np.flatnonzero(~store.coverage.all(axis=(1, 2, 3)))
-        done = len(self.views) - len(missing)
-        for view, mean, spread in self.results(missing, progress, done):
-            store.write_view(view, mean, spread)
+        only = only or Part()
+        views, lights, tiles = only.indices(store)
+        covered = store.coverage[np.ix_(views, lights)][:, :, tiles[0], tiles[1]].all(axis=(1, 2))
+        missing = views[~covered]
+        done = len(views) - len(missing)
+        whole = len(lights) == len(self.lights) and len(tiles[0]) == store.coverage[0, 0].size
+        mask = None if whole else only.mask(store)
+        chosen = None if len(lights) == len(self.lights) else lights
+        for view, mean, spread in self.results(missing, progress, done, lights=chosen, mask=mask):
+            if whole:
+                store.write_view(view, mean, spread)
+            else:
+                store.write_part(view, lights, tiles, mean, spread)
         return store
 
     def _resumable(self, out, overwrite):

@@ -17,7 +17,7 @@ from btfref.errors import InputError
 from btfref.mesostructure import Mesostructure, Part, build
 from btfref.numerics.directions import directions
 from btfref.numerics.quadrature import gauss_hemisphere
-from btfref.sampling import SampledBTF, open_store, path_estimator
+from btfref.sampling import SampledBTF, open_store, path_estimator, tiled_scene
 from btfref.sampling.synthesis import synthesize, synthesize_store
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -167,13 +167,13 @@ def test_rays_that_leave_the_patch_go_on(monkeypatch):
         "resolution": 16,
     }
     wide = synthesize("checker", amplitude=1.0, **settings)
-    monkeypatch.setattr(path_estimator, "MAXIMUM_REACH", 1)
+    monkeypatch.setattr(tiled_scene, "MAXIMUM_REACH", 1)
     wrapped = synthesize("checker", amplitude=1.0, **settings)
     difference = np.abs(wide.values - wrapped.values) / wide.values.max()
     # The same random numbers: only rays that graze an edge may differ by rounding.
     assert np.quantile(difference, 0.99) <= tolerance("synthesis.wrap")
     assert wide.values.mean() > 0
-    monkeypatch.setattr(path_estimator, "MAXIMUM_ROUNDS", 0)
+    monkeypatch.setattr(tiled_scene, "MAXIMUM_ROUNDS", 0)
     cut = synthesize("checker", amplitude=1.0, **settings)
     assert np.quantile(np.abs(wide.values - cut.values) / wide.values.max(), 0.99) > tolerance(
         "synthesis.wrap"

@@ -1,0 +1,169 @@
+"""A BSDF as a broad lobe that separates into view and light, and the rest.
+
+``f = ρ a(cos θ_view) a(cos θ_light) / π + rest``. Light that arrives by way of the broad lobe is the same
+number for all views but for a(cos θ_view), so it is gathered once; the rest is sampled per view. The rest may
+be negative: nothing but noise depends on how good the split is.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+#: Entries of the table of a.
+N_TABLE = 33
+
+#: Largest deviation of a diffuse lobe from the product, relative to its largest value, to be taken as it is.
+SEPARABLE = 2e-3
+
+
+class BroadLobes:
+    """Broad lobes of several BSDFs; build inside a variant.
+
+    Parameters
+    ----------
+    bsdfs : list of mitsuba.BSDF
+
+    Attributes
+    ----------
+    masked : bool
+        Whether every BSDF can sample and evaluate the rest by itself (it honours Mitsuba's type mask).
+    any : bool
+        Whether there is any broad lobe.
+    """
+
+    def __init__(self, bsdfs):
+        import drjit as dr
+        import mitsuba as mi
+
+        self.ids = [int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]) for bsdf in bsdfs]
+        size = max(self.ids) + 1
+        tables, kind = np.ones((size, N_TABLE)), np.zeros(size)
+        transmissive = np.zeros(size)
+        diffuse = int(mi.BSDFFlags.DiffuseReflection)
+        everything = int(mi.BSDFContext().type_mask)
+        self.full, self.diffuse, self.rest = (mi.BSDFContext() for _ in range(3))
+        self.diffuse.type_mask = diffuse
+        self.rest.type_mask = everything & ~diffuse
+        for index, bsdf in zip(self.ids, bsdfs, strict=True):
+            transmissive[index] = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
+            if not mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection):
+                continue
+            table = self._separated(bsdf)
+            kind[index] = 1 if table is None else 2
+            if table is not None:
+                tables[index] = table
+        used = kind[self.ids]
+        # Without a broad lobe everything is the rest, whatever the mask.
+        self.masked = bool((used != 1).all() and (used == 2).any())
+        self.any = bool((used > 0).any())
+        self._kind, self._table = mi.Float(kind), mi.Float(tables.ravel())
+        self.table, self.transmissive = tables, mi.Float(transmissive)
+
+    def _separated(self, bsdf):
+        """The table of a when the BSDF keeps its diffuse lobe apart and that lobe separates; else None."""
+        import drjit as dr
+        import mitsuba as mi
+
+        z = np.linspace(0, 1, N_TABLE)
+        z[0] = 1e-3
+
+        def value(context, wi, wo):
+            si = dr.zeros(mi.SurfaceInteraction3f, len(wi))
+            si.wi, si.uv = mi.Vector3f(wi.T.astype(np.float32)), mi.Point2f(0.37, 0.61)
+            si.n = mi.Normal3f(0, 0, 1)
+            si.sh_frame = mi.Frame3f(si.n)
+            return np.array(bsdf.eval(context, si, mi.Vector3f(wo.T.astype(np.float32)))).T
+
+        rng = np.random.default_rng(0)
+        wi, wo = (np.abs(rng.normal(size=(512, 3))) for _ in range(2))
+        wi, wo = (w / np.linalg.norm(w, axis=1, keepdims=True) for w in (wi, wo))
+        parts = value(self.diffuse, wi, wo) + value(self.rest, wi, wo)
+        full = value(self.full, wi, wo)
+        if np.abs(parts - full).max() > SEPARABLE * np.abs(full).max():
+            return None
+        normal = np.tile([0.0, 0.0, 1.0], (N_TABLE, 1))
+        slanted = np.stack([np.sqrt(1 - z**2), np.zeros_like(z), z], 1)
+        along = value(self.diffuse, slanted, normal)
+        if along[-1].max() <= 0:
+            return None
+        table = along.sum(1) / along[-1].sum()
+        model = np.interp(wi[:, 2], z, table) * np.interp(wo[:, 2], z, table) * wo[:, 2]
+        model = model[:, None] * along[-1]
+        measured = value(self.diffuse, wi, wo)
+        return None if np.abs(model - measured).max() > SEPARABLE * measured.max() else table
+
+    def albedo(self, bsdf, index, si, active=True):
+        """ρ at surface points; 0 where the BSDF has no broad lobe.
+
+        Parameters
+        ----------
+        bsdf : mitsuba.BSDFPtr
+        index : mitsuba.UInt32
+            The same as a number.
+        si : mitsuba.SurfaceInteraction3f
+            Its ``wi`` is not used.
+
+        Returns
+        -------
+        mitsuba.Color3f
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        if not self.any:
+            return mi.Color3f(0)
+        kind = dr.gather(mi.Float, self._kind, index, active)
+        probe = type(si)(si)
+        probe.wi = mi.Vector3f(0, 0, 1)
+        value = bsdf.eval(self.diffuse, probe, mi.Vector3f(0, 0, 1), active & (kind == 2))
+        # Two directions at 60 degrees, at right angles in azimuth: far from any mirror direction.
+        probe.wi = mi.Vector3f(0.8660254, 0, 0.5)
+        far = bsdf.eval(self.full, probe, mi.Vector3f(0, 0.8660254, 0.5), active & (kind == 1))
+        return dr.pi * mi.Color3f(dr.select(kind == 2, value, dr.select(kind == 1, 2 * far, 0)))
+
+    def shape(self, index, cosine, active=True):
+        """a(cos θ); 0 at and below the horizon."""
+        import drjit as dr
+        import mitsuba as mi
+
+        x = dr.clip(cosine, 0, 1) * (N_TABLE - 1)
+        low = dr.minimum(mi.UInt32(x), N_TABLE - 2)
+        t, at = x - mi.Float(low), index * N_TABLE + low
+        a = dr.gather(mi.Float, self._table, at, active)
+        b = dr.gather(mi.Float, self._table, at + 1, active)
+        return dr.select(cosine > 0, dr.lerp(a, b, t), 0)
+
+    def shape_numpy(self, index, cosine):
+        """`shape` for arrays of NumPy."""
+        x = np.clip(cosine, 0, 1) * (N_TABLE - 1)
+        low = np.minimum(x.astype(np.int64), N_TABLE - 2)
+        t = x - low
+        value = self.table[index, low] * (1 - t) + self.table[index, low + 1] * t
+        return np.where(cosine > 0, value, 0)
+
+    def value(self, index, albedo, wi, wo):
+        """Broad lobe times cosine of ``wo``."""
+        import drjit as dr
+
+        return albedo * (self.shape(index, wi.z) * self.shape(index, wo.z) * dr.maximum(wo.z, 0) * dr.inv_pi)
+
+    def sample_rest(self, bsdf, index, albedo, si, lobe, uv, active):
+        """Sample the rest: (BSDFSample3f, weight = rest · cosine / pdf)."""
+        import drjit as dr
+
+        if self.masked:
+            return bsdf.sample(self.rest, si, lobe, uv, active)
+        sample, weight = bsdf.sample(self.full, si, lobe, uv, active)
+        if self.any:
+            import mitsuba as mi
+
+            smooth = active & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta) & (sample.pdf > 0)
+            weight = weight - dr.select(smooth, self.value(index, albedo, si.wi, sample.wo) / sample.pdf, 0)
+        return sample, weight
+
+    def eval_rest(self, bsdf, index, albedo, si, wo, active):
+        """The rest times cosine of ``wo``."""
+        if self.masked:
+            return bsdf.eval(self.rest, si, wo, active)
+        value = bsdf.eval(self.full, si, wo, active)
+        return value - self.value(index, albedo, si.wi, wo) if self.any else value

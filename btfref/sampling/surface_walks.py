@@ -1,0 +1,273 @@
+"""Surface records in Dr.Jit, their visibility, and walks that connect every vertex to all lights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from btfref.sampling.path_estimator import ROULETTE_LIMIT, ROULETTE_VERTEX
+from btfref.sampling.tiled_scene import uniforms
+
+_FIELDS = ("p", "n", "s", "shading", "uv", "number", "albedo")
+
+
+@dataclass
+class Surface:
+    """Places on the surface as Dr.Jit arrays: what a BSDF needs to know of each.
+
+    Attributes
+    ----------
+    p, n, s, shading : mitsuba.Point3f, mitsuba.Vector3f
+        Position, geometric normal, tangent and shading normal.
+    uv : mitsuba.Point2f
+    number : mitsuba.UInt32
+        BSDF as Dr.Jit's number of it; 0 for the absorber.
+    albedo : mitsuba.Color3f
+        ρ of the broad lobe.
+    """
+
+    p: Any
+    n: Any
+    s: Any
+    shading: Any
+    uv: Any
+    number: Any
+    albedo: Any
+
+    @classmethod
+    def of_points(cls, points, lobes):
+        """From `btfref.sampling.surface_points.Points`."""
+        import mitsuba as mi
+
+        ids = np.array([*lobes.ids, 0], np.uint32)  # the absorber's part is −1
+        place = cls(
+            mi.Point3f(points.p.T),
+            mi.Vector3f(points.n.T),
+            mi.Vector3f(points.s.T),
+            mi.Vector3f(points.shading.T),
+            mi.Point2f(points.uv.T),
+            mi.UInt32(ids[points.part]),
+            mi.Color3f(0),
+        )
+        return place._finished(lobes)
+
+    @classmethod
+    def of_interaction(cls, hit, lobes):
+        """From surface interactions; invalid ones become the absorber."""
+        import drjit as dr
+        import mitsuba as mi
+
+        number = dr.reinterpret_array(mi.UInt32, hit.bsdf())
+        number = dr.select(hit.is_valid(), number, 0)
+        place = cls(
+            mi.Point3f(hit.p),
+            mi.Vector3f(hit.n),
+            mi.Vector3f(hit.sh_frame.s),
+            mi.Vector3f(hit.sh_frame.n),
+            mi.Point2f(hit.uv),
+            number,
+            mi.Color3f(0),
+        )
+        return place._finished(lobes)
+
+    def _finished(self, lobes):
+        import drjit as dr
+
+        si, bsdf, number, _ = self.interaction(None)
+        self.albedo = lobes.albedo(bsdf, number, si)
+        self.albedo += dr.zeros(type(self.albedo), dr.width(self.number))
+        dr.eval(*(getattr(self, name) for name in _FIELDS))
+        return self
+
+    def taken(self, index):
+        """The records of an index (mitsuba.UInt32)."""
+        import drjit as dr
+
+        parts = [dr.gather(type(value), value, index) for value in self._values()]
+        dr.eval(*parts)
+        return Surface(*parts)
+
+    def joined(self, other):
+        """These records and then the others."""
+        import drjit as dr
+
+        def both(a, b):
+            if dr.depth_v(a) == 1:
+                return dr.concat([a, b])
+            return type(a)(*(dr.concat([a[k], b[k]]) for k in range(len(a))))
+
+        parts = [both(a, b) for a, b in zip(self._values(), other._values(), strict=True)]
+        dr.eval(*parts)
+        return Surface(*parts)
+
+    def _values(self):
+        return [getattr(self, name) for name in _FIELDS]
+
+    def interaction(self, index, active=True):
+        """Surface interactions, BSDF pointers, their numbers, and ρ, at an index (None for all)."""
+        import drjit as dr
+        import mitsuba as mi
+
+        values = self._values()
+        if index is not None:
+            values = [dr.gather(type(value), value, index, active) for value in values]
+        p, n, s, shading, uv, number, albedo = values
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
+        si.p, si.n, si.uv, si.dp_du = p, mi.Normal3f(n), uv, s
+        si.sh_frame = mi.Frame3f(s, dr.cross(shading, s), mi.Normal3f(shading))
+        return si, dr.reinterpret_array(mi.BSDFPtr, number), number, albedo
+
+
+def visibility(tiles, surface, directions, *, front_only=False, towards=None, through=False):
+    """Which directions the records see.
+
+    Parameters
+    ----------
+    tiles : TiledScene
+    surface : Surface
+    directions : ndarray (n, 3)
+    front_only : bool
+        Leave out what lies behind the surface.
+    towards : mitsuba.Vector3f, optional
+        Where light came from: leave out what reflection from there cannot reach.
+    through : mitsuba.Bool
+        Where the BSDF transmits, so that nothing may be left out.
+
+    Returns
+    -------
+    ndarray (n, records) of uint8
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    n_records, n_directions = dr.width(surface.number), len(directions)
+    result = dr.zeros(mi.UInt8, n_records * n_directions)
+    vectors = mi.Float(np.asarray(directions, np.float32).ravel())
+    count, records = dr.opaque(mi.UInt32, n_directions), dr.opaque(mi.UInt32, n_records)
+    lane = dr.arange(mi.UInt32, n_records)
+    si = dr.zeros(mi.SurfaceInteraction3f, n_records)
+    si.p, si.n = surface.p, mi.Normal3f(surface.n)
+    side = None if towards is None else dr.dot(surface.shading, towards)
+
+    def look(i):
+        w = dr.gather(mi.Vector3f, vectors, i)
+        active = mi.Bool(True)
+        if front_only:
+            active &= dr.dot(si.n, w) > 0
+        if side is not None:
+            active &= through | (side * dr.dot(surface.shading, w) > 0)
+        free = active & ~tiles.occluded(si.spawn_ray(w), active)
+        dr.scatter(result, mi.UInt8(dr.select(free, mi.UInt32(1), mi.UInt32(0))), dr.fma(i, records, lane))
+        return (i + 1,)
+
+    dr.while_loop((dr.zeros(mi.UInt32, n_records),), lambda i: i < count, look)
+    return result.numpy().reshape(n_directions, n_records)
+
+
+def connect(lobes, lights, target, si, bsdf, number, albedo, weight, offset, sees, *, stride, broad=False):
+    """Add weight · BSDF · cosine · visibility of all lights to ``target``.
+
+    Parameters
+    ----------
+    sees : callable
+        ``sees(light, w_light) -> mitsuba.Bool``; asked last.
+    broad : bool
+        Only the broad lobe.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    count = dr.opaque(mi.UInt32, dr.width(lights) // 3)
+
+    def step(i):
+        w = dr.gather(mi.Vector3f, lights, i)
+        local = si.to_local(w)
+        if broad:
+            value = lobes.value(number, albedo, si.wi, local)
+        else:
+            value = bsdf.eval(lobes.full, si, local)
+        value = weight * value
+        lit = dr.max(dr.abs(value)) > 0
+        lit &= sees(i, lit)
+        at = dr.fma(i, stride, offset)
+        for channel in range(3):
+            # Each lane owns its entries: no atomics, and the same bytes every time.
+            dr.scatter_add(target, value[channel], at + channel, lit, mode=dr.ReduceMode.NoConflicts)
+        return (i + 1,)
+
+    dr.while_loop((dr.zeros(mi.UInt32, dr.width(offset)),), lambda i: i < count, step)
+    dr.eval(target)
+
+
+def continue_walks(tiles, lobes, lights, target, state, keys, *, vertex, last, stride, broad_first):
+    """Follow walks from their first ray to the last vertex, connecting each vertex to all lights.
+
+    Parameters
+    ----------
+    state : dict
+        ``lane``, ``target`` (offset), ``origin``, ``direction``, ``weight``.
+    vertex, last : int
+        Number of the next vertex of the path (the visible point is 1), and of the last one.
+    broad_first : bool
+        At the first vertex connect by the broad lobe only: photons bring the rest.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    names = ("lane", "target", "origin", "direction", "weight")
+    values = [state[name] for name in names]
+    alive = dr.max(dr.abs(values[4])) > 0
+    dr.eval(values, alive)
+    first = True
+    while vertex <= last:
+        index = dr.compress(alive)
+        if dr.width(index) == 0:
+            return
+        lane, offset, origin, direction, weight = (dr.gather(type(a), a, index) for a in values)
+        hit = tiles.intersect(origin, direction)
+        reached = hit.is_valid()
+        dr.eval(hit, reached, lane, offset, direction, weight)
+        index = dr.compress(reached)
+        if dr.width(index) == 0:
+            return
+        si = dr.gather(type(hit), hit, index)
+        lane, offset, weight = (dr.gather(type(a), a, index) for a in (lane, offset, weight))
+        bsdf = si.bsdf()
+        number = dr.reinterpret_array(mi.UInt32, bsdf)
+        depth = dr.opaque(mi.UInt32, 2 * vertex)
+        lobe, u, v, roulette = uniforms(lane, keys, depth)
+        roulette, _, _, _ = uniforms(lane, keys, depth + 1)
+        follow = vertex < last
+        if follow:
+            sample, gain = bsdf.sample(lobes.full, si, lobe, mi.Point2f(u, v))
+            onward = weight * gain
+            survival = dr.minimum(dr.max(dr.abs(onward)), ROULETTE_LIMIT)
+            survival = dr.select(dr.opaque(mi.UInt32, vertex) >= ROULETTE_VERTEX, survival, 1)
+            alive = (dr.max(dr.abs(onward)) > 0) & (roulette < survival)
+            onward = dr.select(alive, onward / survival, 0)
+            ray = si.spawn_ray(si.to_world(sample.wo))
+            values = [lane, offset, mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Color3f(onward)]
+            dr.eval(values, alive)
+        albedo = lobes.albedo(bsdf, number, si) if first and broad_first else None
+
+        def sees(i, lit, si=si):
+            return ~tiles.occluded(si.spawn_ray(dr.gather(mi.Vector3f, lights, i)), lit)
+
+        connect(
+            lobes,
+            lights,
+            target,
+            si,
+            bsdf,
+            number,
+            albedo,
+            weight,
+            offset,
+            sees,
+            stride=stride,
+            broad=first and broad_first,
+        )
+        first = False
+        vertex += 1

@@ -1,0 +1,158 @@
+"""The infinitely tiled mesostructure as a Mitsuba scene, with rays that never see the end of it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+#: Largest number of tiles on each side of the central one; beyond it rays are wrapped instead.
+MAXIMUM_REACH = 4
+
+#: Crossings of the tiled patch after which a ray counts as escaped. A ray needs |d_z| below
+#: height / (MAXIMUM_ROUNDS · reach), i.e. under 1e-4 · height, and no hit on its way, to be concerned.
+MAXIMUM_ROUNDS = 10_000
+
+#: Where a view ray starts, in tile units above the sampling plane along w_view.
+START = 0.125
+
+
+class TiledScene:
+    """A patch of tiles; rays that leave it inside the slab of the mesostructure enter the other side.
+
+    Parameters
+    ----------
+    mesostructure : Mesostructure
+    directions : ndarray, shape (n, 3)
+        Unit vectors of the rays to the outside: the patch is made large enough for them, up to a limit.
+
+    Attributes
+    ----------
+    scene : mitsuba.Scene
+    bsdfs : list of mitsuba.BSDF
+        One per part.
+    """
+
+    def __init__(self, mesostructure, directions):
+        import mitsuba as mi
+
+        from btfref.mesostructure.tiling import tiled_shapes
+
+        self.low, self.high = mesostructure.height
+        up = np.asarray(directions, dtype=np.float64)
+        z = up[up[:, 2] > 0, 2]
+        z = z if len(z) else np.ones(1)
+        across = -self.low * float((np.sqrt(1 - np.minimum(z, 1) ** 2) / z).max()) + mesostructure.overhang
+        # A shadow ray from the depth of the mesostructure to its top must not leave the patch, or it is
+        # wrapped.
+        self.reach = int(np.clip(math.ceil(across + START), 1, MAXIMUM_REACH))
+        self.wrap_shadows = across > self.reach
+        # Geometry that sticks out of its tile must be complete as far as any ray goes.
+        margin = self.reach + math.ceil(mesostructure.overhang)
+        offsets = range(-margin, margin + 1)
+        self.bsdfs = [mi.load_dict(part.bsdf) for part in mesostructure.parts]
+        shapes = tiled_shapes(mesostructure, offsets, offsets, bsdfs=self.bsdfs)
+        self.scene = mi.load_dict({"type": "scene", **shapes})
+
+    def _travel(self, direction):
+        """Distance along a ray from the central tile that surely stays in the patch."""
+        import drjit as dr
+
+        return dr.minimum(self.reach / dr.maximum(dr.abs(direction.x), dr.abs(direction.y)), 1e4)
+
+    def _wrapped(self, origin, direction, travel):
+        """The place at the patch's border, taken to the central tile, and whether the slab goes on there."""
+        import drjit as dr
+        import mitsuba as mi
+
+        end = dr.fma(direction, travel, origin)
+        inside = dr.select(direction.z <= 0, end.z >= self.low, end.z <= self.high)
+        return mi.Point3f(end.x - dr.floor(end.x), end.y - dr.floor(end.y), end.z), inside
+
+    def intersect(self, origin, direction):
+        """First hit of rays on the infinitely tiled surface, moved to the central tile.
+
+        Parameters
+        ----------
+        origin : mitsuba.Point3f
+        direction : mitsuba.Vector3f
+
+        Returns
+        -------
+        mitsuba.SurfaceInteraction3f
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        travel = self._travel(direction)
+        origin = mi.Point3f(origin.x - dr.floor(origin.x), origin.y - dr.floor(origin.y), origin.z)
+
+        def search(origin, hit, searching, rounds):
+            ray = mi.Ray3f(origin, direction)
+            ray.maxt = travel
+            hit = self.scene.ray_intersect_preliminary(ray, coherent=False, active=searching)
+            end, inside = self._wrapped(origin, direction, travel)
+            searching = searching & ~hit.is_valid() & inside & (rounds < MAXIMUM_ROUNDS)
+            origin = dr.select(searching, end, origin)
+            return origin, hit, searching, rounds + 1
+
+        hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(origin))
+        hit.t = dr.full(mi.Float, math.inf, dr.width(origin))
+        searching = dr.full(mi.Bool, True, dr.width(origin))
+        rounds = dr.zeros(mi.UInt32, dr.width(origin))
+        state = (origin, hit, searching, rounds)
+        origin, hit, _, _ = dr.while_loop(state, lambda origin, hit, searching, rounds: searching, search)
+        interaction = hit.compute_surface_interaction(
+            mi.Ray3f(origin, direction), mi.RayFlags.All, hit.is_valid()
+        )
+        p = interaction.p
+        interaction.p = mi.Point3f(p.x - dr.floor(p.x), p.y - dr.floor(p.y), p.z)
+        return interaction
+
+    def occluded(self, ray, active):
+        """Whether the infinitely tiled surface blocks rays that start in the central tile.
+
+        Parameters
+        ----------
+        ray : mitsuba.Ray3f
+        active : mitsuba.Bool
+
+        Returns
+        -------
+        mitsuba.Bool
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        if not self.wrap_shadows:
+            return self.scene.ray_test(ray, coherent=True, active=active)
+        travel, direction = self._travel(ray.d), mi.Vector3f(ray.d)
+
+        def search(origin, blocked, searching, rounds):
+            part = mi.Ray3f(origin, direction)
+            part.maxt = travel
+            blocked = blocked | self.scene.ray_test(part, coherent=True, active=searching)
+            end, inside = self._wrapped(origin, direction, travel)
+            searching = searching & ~blocked & inside & (rounds < MAXIMUM_ROUNDS)
+            return dr.select(searching, end, origin), blocked, searching, rounds + 1
+
+        state = (mi.Point3f(ray.o), mi.Bool(False), mi.Bool(active), mi.UInt32(0))
+        return dr.while_loop(state, lambda origin, blocked, searching, rounds: searching, search)[1]
+
+
+def uniforms(lane, keys, dimension):
+    """Four numbers in [0, 1) per lane and dimension: counter-based, so that no state travels with a path."""
+    import mitsuba as mi
+
+    a, b = mi.sample_tea_32(lane ^ keys[0], keys[1], 6)
+    words = (*mi.sample_tea_32(a, b + 2 * dimension, 6), *mi.sample_tea_32(a, b + 2 * dimension + 1, 6))
+    return tuple(mi.Float(word >> 8) * 2.0**-24 for word in words)
+
+
+def stream_keys(*words):
+    """Two opaque words that select a stream of `uniforms`; from any number of integers."""
+    import drjit as dr
+    import mitsuba as mi
+
+    state = np.random.SeedSequence([int(word) for word in words]).generate_state(2, np.uint32)
+    return [dr.opaque(mi.UInt32, int(word)) for word in state]
