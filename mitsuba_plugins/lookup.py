@@ -263,13 +263,11 @@ class PairTable:
     def update(self, values):
         """Take new values; differentiable ones are kept as they are, so that gradients reach them."""
         self.outer, self.n_views, self.n_lights, self.width = values.shape
-        self.words, self.values = None, values.array
-        if dr.type_v(self.values) != dr.VarType.Float16 or dr.grad_enabled(self.values):
-            return
-        halves = values.numpy()
-        if np.abs(halves).max() > HALF_LIMIT:
-            self.values = mi.Float(self.values)
-            dr.eval(self.values)
+        self.words, self.values = None, None
+        packable = dr.type_v(values.array) == dr.VarType.Float16 and not dr.grad_enabled(values.array)
+        halves = values.numpy() if packable else None
+        if not packable or np.abs(halves).max() > HALF_LIMIT:
+            self.values = wide(values)
             return
         halves = (halves * np.float16(HALF_SHIFT)).view(np.uint16)
         if self.following is None:
@@ -279,8 +277,6 @@ class PairTable:
             words |= halves
         self.words = dr.reinterpret_array(mi.Float, mi.UInt32(words.ravel()))
         dr.eval(self.words)
-        # The plain copy is only needed for gradients.
-        self.values = None
 
     def combine(self, outer, views, lights, coefficients, active=True):
         """Interpolate over views and lights, and combine the colours of an entry linearly.
@@ -367,9 +363,7 @@ def _add(total, values, coefficients, weight):
 
 
 def wide(values):
-    """Values of a small table as float32, which is read in packets; differentiable ones are left as they are."""
-    if dr.grad_enabled(values.array) or dr.type_v(values.array) != dr.VarType.Float16:
-        return values.array
+    """Values of a table as float32, which is read in packets; gradients pass the conversion."""
     result = mi.Float(values.array)
     dr.eval(result)
     return result
@@ -378,8 +372,6 @@ def wide(values):
 def read_packets(array, entry, width, active=True):
     """``width`` consecutive values of entry ``entry``, gathered in the largest packets that fit."""
     result = []
-    if dr.type_v(array) == dr.VarType.Float16:
-        return [dr.gather(mi.Float16, array, entry * width + k, active) for k in range(width)]
     while len(result) < width:
         # Packets must be aligned to their own size.
         if width % 16 == 0:
