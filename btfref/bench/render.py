@@ -142,7 +142,10 @@ def _scenes(mi):
 
 
 def _with_material(scene, bsdf):
-    return scene | {"shape": scene["shape"] | {"bsdf": {"type": "twosided", "bsdf": bsdf}}}
+    # Mitsuba evaluates both sides of a ``twosided`` material: only where the back can be seen.
+    if scene["shape"]["type"] != "sphere":
+        bsdf = {"type": "twosided", "bsdf": bsdf}
+    return scene | {"shape": scene["shape"] | {"bsdf": bsdf}}
 
 
 def _render_task(mi, dr, scene):
