@@ -6,4 +6,5 @@ from __future__ import annotations
 SUITES = {
     "fit": "btfref.bench.fit",
     "render": "btfref.bench.render",
+    "synth": "btfref.bench.synth",
 }
