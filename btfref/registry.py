@@ -72,6 +72,10 @@ _ROWS = (
     _row("raw", "Tabulated BTF, interpolated", "Dana et al. 1999"),
     _row("svd", "Global truncated singular value decomposition", "Koudelka et al. 2003"),
     _row("lpca", "Local PCA (eigen-BRDFs per cluster)", "Müller, Meseth, Klein 2003 and 2004"),
+    _row("rf_poly", "Reflectance fields: biquadratic polynomials per view", "Meseth, Müller, Klein 2004"),
+    _row("rf_lobes", "Reflectance fields: cosine lobes per view", "Meseth, Müller, Klein 2004"),
+    _row("lafortune", "Generalized cosine lobes per texel", "Lafortune et al. 1997, McAllister et al. 2002"),
+    _row("lafortune_lut", "Lafortune lobes times a table over views", "Daubert et al. 2001"),
 )
 
 

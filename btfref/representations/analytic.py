@@ -1,0 +1,189 @@
+"""What the methods share that store functions of the light instead of tables over it (Meseth, Müller, Klein 2004).
+
+They model luminance; the colour is the texel's chroma times it, as in polynomial texture maps (Malzbender, Gelb and
+Wolters 2001, section 3.4). Below the outermost measured light the function is held and faded by the cosine, which is
+the convention for lights beyond the last ring, so that nothing is extrapolated towards the horizon.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from btfref import conventions
+from btfref.errors import InputError
+from btfref.numerics import interpolation
+from btfref.representations.guide import feature_views, texel_groups
+from btfref.representations.lookup import CHUNK
+
+#: Texels fitted at a time: bounds the memory of luminance tables and of normal equations.
+BLOCK = 4096
+
+#: Members of a group of texels whose mean guides importance sampling.
+GUIDE_MEMBERS = 16
+
+
+@dataclass(frozen=True)
+class Lookups:
+    """N lookups: neighbours (indices and weights, (N, T) and (N, V)) and directions held at the measured edge (N, 3)."""
+
+    texel: np.ndarray
+    texel_weight: np.ndarray
+    view: np.ndarray
+    view_weight: np.ndarray
+    w_light: np.ndarray
+    w_view: np.ndarray
+
+
+def evaluate_analytic(representation, kernel, uv, w_light, w_view):
+    """Evaluate a method whose maps are functions of the light.
+
+    Parameters
+    ----------
+    representation : Representation
+        Its meta holds the constants ``light_edge`` and ``view_edge``.
+    kernel : callable
+        ``Lookups -> (N, 3)`` float64.
+    uv, w_light, w_view : array_like, shape (..., 2), (..., 3), (..., 3)
+
+    Returns
+    -------
+    ndarray of float64, shape (..., 3)
+    """
+    meta = representation.meta
+    views = interpolation.from_arrays(representation.arrays(), "view")
+    uv, w_light, w_view = (np.asarray(a, float) for a in (uv, w_light, w_view))
+    shape = np.broadcast_shapes(uv.shape[:-1], w_light.shape[:-1], w_view.shape[:-1])
+    uv, w_light, w_view = (np.broadcast_to(a, (*shape, a.shape[-1])).reshape(-1, a.shape[-1]) for a in (uv, w_light, w_view))
+    result = np.zeros((len(uv), 3))
+    for start in range(0, len(uv), CHUNK):
+        part = slice(start, start + CHUNK)
+        valid = conventions.valid_directions(w_light[part]) & conventions.valid_directions(w_view[part])
+        if not valid.any():
+            continue
+        texel, texel_weight = conventions.texel_stencil(uv[part][valid], meta["texels"], meta["filter_type"])
+        view, view_weight = views.stencil(w_view[part][valid])
+        light, fade = held(w_light[part][valid], meta["constants"]["light_edge"])
+        held_view, _ = held(w_view[part][valid], meta["constants"]["view_edge"])
+        lookups = Lookups(texel, texel_weight, view, view_weight, light, held_view)
+        result[part][valid] = fade[:, None] * kernel(lookups)
+    return result.reshape(*shape, 3)
+
+
+def held(w, edge):
+    """Directions raised to the outermost measured cosine, and what lights below it fade by.
+
+    Parameters
+    ----------
+    w : array_like, shape (..., 3)
+        Unit vectors above the horizon.
+    edge : float
+        Smallest measured cosine.
+
+    Returns
+    -------
+    w : ndarray, shape (..., 3)
+        Azimuth kept, ``z`` at least ``edge``.
+    fade : ndarray, shape (...)
+        ``z / edge`` where that is below 1, else 1.
+    """
+    w = np.asarray(w, float)
+    z = w[..., 2]
+    below = z < edge
+    radius = np.hypot(w[..., 0], w[..., 1])
+    scale = np.where(below, np.sqrt(max(1 - edge * edge, 0)) / np.where(below, radius, 1), 1)
+    raised = np.concatenate([w[..., :2] * scale[..., None], np.maximum(z, edge)[..., None]], -1)
+    return raised, np.where(below, z / max(edge, 1e-30), 1)
+
+
+def edge_constants(btf):
+    """The smallest measured cosines; 0, which holds nothing, where they reach the horizon."""
+    edges = {"light_edge": btf.lights.vectors[:, 2].min(), "view_edge": btf.views.vectors[:, 2].min()}
+    return {name: float(np.float32(edge)) if edge > 1e-6 else 0.0 for name, edge in edges.items()}
+
+
+def luminance_blocks(btf, progress=None, label="fit"):
+    """Luminance and chroma of the texels, some at a time.
+
+    Parameters
+    ----------
+    btf : SampledBTF
+    progress : callable, optional
+        ``progress(done, total, label)`` after each block.
+
+    Yields
+    ------
+    part : slice
+        Of the flat texel index.
+    luminance : ndarray of float32, shape (n_views, n_lights, n)
+    chroma : ndarray of float64, shape (n, 3)
+        Best common colour of all samples of a texel, of luminance 1: ``Σ B Y / Σ Y²``.
+
+    Raises
+    ------
+    InputError
+        For values that are not finite.
+    """
+    n_views, n_lights, rows, columns, _ = btf.values.shape
+    step = max(1, BLOCK // columns)
+    for first in range(0, rows, step):
+        block = np.asarray(btf.values[:, :, first : first + step], np.float32).reshape(n_views, n_lights, -1, 3)
+        if not np.isfinite(block).all():
+            raise InputError("the BTF holds a value that is not finite", file=getattr(btf, "path", None))
+        luminance = block @ conventions.LUMINANCE.astype(np.float32)
+        energy = np.einsum("vln,vln->n", luminance, luminance, dtype=float)
+        chroma = np.einsum("vlnc,vln->nc", block, luminance, dtype=float)
+        chroma = np.where(energy[:, None] > 0, chroma / np.where(energy > 0, energy, 1)[:, None], 1.0)
+        part = slice(first * columns, min(first + step, rows) * columns)
+        yield part, luminance, chroma
+        if progress:
+            progress(part.stop, rows * columns, label)
+
+
+def mean_absolute_error(representation, btf):
+    """ε of each texel: mean of |B − model| in luminance over all measured pairs; the paper's eq. 2.
+
+    Returns
+    -------
+    ndarray of float64, shape (n_texels,)
+        In units of the radiance factor π B, where a white diffuser under perpendicular light has 1.
+    """
+    n_views = len(btf.views)
+    result = np.zeros(int(np.prod(btf.values.shape[2:4])))
+    for part, luminance, _ in luminance_blocks(btf):
+        texels = np.arange(part.start, part.stop)
+        for view in range(n_views):
+            model = representation.luminance_tables(texels, np.array([view]))[:, 0]
+            result[part] += np.pi * np.abs(luminance[view].T - model).mean(1, dtype=float) / n_views
+    return result
+
+
+def fit_report(representation, btf):
+    """JSON-able average, least and largest ε over texels, as Table 1 of the paper has them."""
+    error = mean_absolute_error(representation, btf)
+    return {"average": float(error.mean()), "minimum": float(error.min()), "maximum": float(error.max())}
+
+
+def sampling_tables(representation):
+    """See the protocol; groups by shape, means over a few members of each.
+
+    Uses the method's ``luminance_tables(texels, views) -> (n, n_views, n_lights)``.
+    """
+    rows, columns = representation.meta["texels"]
+    n_views = len(representation.arrays()["view_directions"])
+    some = feature_views(n_views)
+    features = [
+        representation.luminance_tables(np.arange(first, min(first + BLOCK, rows * columns)), some)
+        for first in range(0, rows * columns, BLOCK)
+    ]
+    labels = texel_groups(np.concatenate(features).reshape(rows * columns, -1))
+    means = []
+    for group in range(int(labels.max()) + 1):
+        members = np.flatnonzero(labels == group)
+        members = members[np.linspace(0, len(members) - 1, min(len(members), GUIDE_MEMBERS)).round().astype(int)]
+        if len(members):
+            means.append(representation.luminance_tables(members, np.arange(n_views)).mean(0))
+        else:
+            means.append(np.zeros((n_views, len(representation.arrays()["light_directions"])), np.float32))
+    return labels.reshape(rows, columns), np.stack(means)

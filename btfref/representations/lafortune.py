@@ -1,0 +1,277 @@
+"""Generalized cosine lobes per texel: the baseline "LAF" of reflectance fields.
+
+Sources: E. Lafortune et al., "Non-Linear Approximation of Reflectance Functions", SIGGRAPH 1997, eq. 8; D. McAllister et
+al., "Efficient Rendering of Spatial Bi-directional Reflectance Distribution Functions", Graphics Hardware 2002;
+Meseth, Müller, Klein 2004, Table 1: ``f = ρ_d + Σ_j (C_x l_x v_x + C_y l_y v_y + C_z l_z v_z)^n`` of luminance, times the
+texel's chroma.
+
+The model is one of f; the data are ``B = f l_z``, so ``f l_z`` is fitted to them and nothing is divided by the cosine.
+A lobe is stored as coefficients in [−1, 1], exponent and peak, instead of as ``C``, whose power could overflow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from btfref.numerics.levenberg import BatchFit, fit_batch
+from btfref.numerics.powers import FLOOR, safe_power
+from btfref.representations import analytic
+from btfref.representations.lobe_start import exponent_limit
+from btfref.representations.lookup import base_meta, direction_arrays, packed_arrays, positive_integer, stored
+
+#: "paper": Table 1's four lobes, in floats.
+PRESETS = {"paper": {"lobes": 4, "storage": "float"}}
+
+#: Largest peak and diffuse albedo relative to the brightest sample of the texel: f exceeds B by 1 / cos 75° = 3.9.
+PEAK_BOUND = 4.0
+
+#: Starts of lobes: coefficients, exponent. Forward and backward reflection, broad and narrow, and one about the normal.
+STARTS = (
+    (-1.0, -1.0, 1.0, 8.0),
+    (1.0, 1.0, 1.0, 4.0),
+    (0.1, 0.1, 1.0, 2.0),
+    (-1.0, -1.0, 1.0, 40.0),
+)
+
+
+@dataclass(frozen=True)
+class Representation:
+    """``lobes`` [row, column, 4 k]: coefficients and exponent of each lobe; ``peaks`` [row, column, k];
+    ``colour`` [row, column, 4]: chroma and ρ_d in 1/sr; and the direction tables.
+    """  # noqa: D205
+
+    maps: dict
+    meta: dict
+
+    def evaluate(self, uv, w_light, w_view, *, lod=0.0):
+        """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored. Never negative."""
+        maps = flat_maps(self.maps)
+
+        def kernel(s):
+            value = texel_values(maps, s)
+            return np.einsum("nt,ntc,nt->nc", s.texel_weight, maps["colour"][s.texel, :3], value)
+
+        return analytic.evaluate_analytic(self, kernel, uv, w_light, w_view)
+
+    def luminance_tables(self, texels, views):
+        """Model of luminance at measured views and all measured lights, shape (n, n_views, n_lights)."""
+        return luminance_tables(self.maps, texels, views)
+
+    def arrays(self):
+        """``lobes``, ``peaks``, ``colour`` and the direction tables."""
+        return self.maps
+
+    def port_arrays(self):
+        """As stored: a lobe is one texel."""
+        return packed_arrays(self.maps)
+
+    def sampling_tables(self):
+        """Groups of texels alike, and their means."""
+        return analytic.sampling_tables(self)
+
+    @classmethod
+    def from_arrays(cls, arrays, meta):
+        return cls(arrays, meta)
+
+
+def flat_maps(maps):
+    """The maps of the texels by flat index, in float64; lobes as (n, k, 4)."""
+    names = [name for name in maps if not name.startswith(("view_", "light_"))]
+    flat = {name: maps[name].reshape(-1, maps[name].shape[-1]).astype(float) for name in names}
+    flat["lobes"] = flat["lobes"].reshape(len(flat["lobes"]), -1, 4)
+    return flat
+
+
+def texel_values(maps, s):
+    """``f l_z`` of each texel of a lookup, shape (N, T)."""
+    product = (s.w_light * s.w_view)[:, None, None]
+    lobes = maps["lobes"][s.texel]
+    power = safe_power((lobes[..., :3] * product).sum(-1), lobes[..., 3])
+    return s.w_light[:, None, 2] * (maps["colour"][s.texel, 3] + (maps["peaks"][s.texel] * power).sum(-1))
+
+
+def luminance_tables(maps, texels, views):
+    """See :meth:`Representation.luminance_tables`; float32."""
+    lights = maps["light_directions"].astype(np.float32)
+    product = maps["view_directions"][views].astype(np.float32)[:, None] * lights
+    lobes = maps["lobes"].reshape(-1, maps["lobes"].shape[-1] // 4, 4)[texels].astype(np.float32)
+    peaks = maps["peaks"].reshape(-1, lobes.shape[1])[texels].astype(np.float32)
+    result = maps["colour"].reshape(-1, 4)[texels, 3].astype(np.float32)[:, None, None]
+    for j in range(lobes.shape[1]):
+        base = np.maximum(np.einsum("nc,vlc->nvl", lobes[:, j, :3], product, optimize=True), np.float32(FLOOR))
+        result = result + peaks[:, j, None, None] * np.exp2(lobes[:, j, 3, None, None] * np.log2(base))
+    return result * lights[:, 2]
+
+
+def lafortune_residual(module, luminance, views, lights, n_lobes, factor=None):
+    """Residual and Jacobian for :func:`fit_batch`.
+
+    Parameters
+    ----------
+    module : module
+        Of :func:`btfref.numerics.levenberg.backend`.
+    luminance : ndarray of float32, shape (n_views, n_lights, N)
+    views, lights : ndarray, shape (n, 3)
+    n_lobes : int
+    factor : ndarray of float32, shape (n_views, N), optional
+        View-dependent factor of the model.
+
+    Returns
+    -------
+    callable
+        Parameters of each lane: ρ_d; for each lobe the coefficients, natural logarithm of the exponent, peak.
+    """
+    import drjit as dr
+
+    Float = module.Float
+    n_lights, n = luminance.shape[1:]
+    data = Float(luminance.ravel())
+    product = (views[:, None] * lights[None]).astype(np.float32)
+    cosine = np.broadcast_to(lights[None, :, 2:], (*product.shape[:2], 1)).astype(np.float32)
+    table = Float(np.concatenate([product, cosine], -1).ravel())
+    factor = None if factor is None else Float(np.ascontiguousarray(factor, np.float32).ravel())
+
+    def residual(p, lane, sample):
+        *w, scale = dr.gather(module.Array4f, table, sample)
+        if factor is not None:
+            scale = scale * dr.gather(Float, factor, dr.fma(sample // n_lights, n, lane))
+        value, row = p[0], [scale]
+        for j in range(n_lobes):
+            *c, log_exponent, peak = p[1 + 5 * j : 6 + 5 * j]
+            base = dr.fma(c[0], w[0], dr.fma(c[1], w[1], c[2] * w[2]))
+            there = base > FLOOR
+            exponent = dr.exp(log_exponent)
+            safe = dr.select(there, base, 1)
+            log = dr.log2(safe)
+            power = dr.select(there, dr.exp2(exponent * log), 0)
+            part = peak * power
+            value = value + part
+            slope = scale * dr.select(there, part * exponent / safe, 0)
+            row += [slope * w[0], slope * w[1], slope * w[2]]
+            row += [scale * part * exponent * log * 0.6931471805599453, scale * power]
+        return dr.fma(value, scale, -dr.gather(Float, data, dr.fma(sample, n, lane))), row
+
+    return residual
+
+
+def bounds(luminance, lights, n_lobes):
+    """Start, lower and upper bounds of the parameters; luminance (n_views, n_lights, N) -> three (N, 1 + 5 k)."""
+    peak = np.maximum(luminance.max((0, 1)), 1e-12)[:, None]
+    limit, ones = exponent_limit(lights), np.ones_like(peak)
+    start, lower, upper = [0.1 * peak], [0 * peak], [PEAK_BOUND * peak]
+    for j in range(n_lobes):
+        *coefficients, exponent = STARTS[j % len(STARTS)]
+        # A fifth start, if it is wanted, is the first again but twice as sharp.
+        exponent = min(exponent * 2 ** (j // len(STARTS)), limit)
+        start += [*(c * ones for c in coefficients), np.log(exponent) * ones, 0.2 * peak]
+        lower += [-ones, -ones, -ones, 0 * ones, 0 * ones]
+        upper += [ones, ones, ones, np.log(limit) * ones, PEAK_BOUND * peak]
+    return tuple(np.concatenate(columns, 1).astype(np.float32) for columns in (start, lower, upper))
+
+
+def fit_lafortune(luminance, views, lights, n_lobes, *, start=None, factor=None, iterations=150):
+    """Lobes of N texels.
+
+    Parameters
+    ----------
+    luminance : ndarray of float32, shape (n_views, n_lights, N)
+    views, lights : DirectionSet
+    n_lobes : int
+    start : ndarray, shape (N, 1 + 5 k), optional
+    factor : ndarray, shape (n_views, N), optional
+    iterations : int
+
+    Returns
+    -------
+    btfref.numerics.levenberg.BatchFit
+    """
+    from btfref.numerics.levenberg import backend
+
+    first, lower, upper = bounds(luminance, lights, n_lobes)
+    residual = lafortune_residual(backend(), luminance, views.vectors, lights.vectors, n_lobes, factor)
+    n_samples = len(views) * len(lights)
+    return fit_batch(residual, first if start is None else start, lower, upper, n_samples, iterations=iterations)
+
+
+def lobe_maps(parameters):
+    """Maps of fitted parameters (N, 1 + 5 k): lobes (N, 4 k), peaks (N, k), ρ_d (N,).
+
+    Coefficients are scaled to a largest magnitude of 1 and the peak makes up for it: what is stored is unique, and as
+    exact in halves as it can be.
+    """
+    lobes = parameters[:, 1:].reshape(len(parameters), -1, 5).astype(float)
+    exponent = np.exp(lobes[..., 3])
+    largest = np.abs(lobes[..., :3]).max(-1)
+    safe = np.where(largest > FLOOR, largest, 1)
+    peaks = lobes[..., 4] * safe_power(np.minimum(largest, 1), exponent)
+    lobes = np.concatenate([lobes[..., :3] / safe[..., None], exponent[..., None]], -1)
+    return lobes.reshape(len(parameters), -1), peaks, parameters[:, 0]
+
+
+def fit(btf, *, seed=0, progress=None, lobes=4, storage="half", filter_type="bilinear"):
+    """Fit Lafortune lobes to each texel of ``btf`` by batched Levenberg–Marquardt.
+
+    Parameters
+    ----------
+    btf : SampledBTF
+    seed : int
+        Unused: nothing is random.
+    progress : callable, optional
+        ``progress(done, total, label)``.
+    lobes : int
+        Per texel, at least 1.
+    storage : {"half", "float"}
+    filter_type : {"bilinear", "nearest"}
+
+    Returns
+    -------
+    Representation
+        ``meta["fit"]`` holds ``epsilon`` (see :func:`analytic.fit_report`), the counts of
+        :attr:`btfref.numerics.levenberg.BatchFit.summary` and ``not_converged_at``, up to 1000 texels.
+
+    Raises
+    ------
+    InputError
+        For parameters out of range, or values that are not finite or do not fit ``storage``.
+    MissingDependencyError
+        Without LLVM or CUDA.
+    """
+    n_lobes = positive_integer("lobes", lobes)
+
+    def fit_block(luminance):
+        result = fit_lafortune(luminance, btf.views, btf.lights, n_lobes)
+        return result, {}
+
+    parameters = {"lobes": n_lobes, "storage": storage, "seed": seed}
+    maps, meta = fit_texels("lafortune", btf, fit_block, parameters, progress, storage, filter_type)
+    result = Representation(maps, meta)
+    meta["fit"]["epsilon"] = analytic.fit_report(result, btf)
+    return result
+
+
+def fit_texels(method, btf, fit_block, parameters, progress, storage, filter_type):
+    """Maps and meta of a fit of one Lafortune model a texel.
+
+    Parameters
+    ----------
+    fit_block : callable
+        ``luminance (n_views, n_lights, n) -> (BatchFit, {name: (n, width) further maps})``.
+    """
+    rows, columns = btf.values.shape[2:4]
+    blocks, fits = [], []
+    for _, luminance, chroma in analytic.luminance_blocks(btf, progress, "lobes"):
+        result, further = fit_block(luminance)
+        lobes, peaks, diffuse = lobe_maps(result.parameters)
+        colour = np.concatenate([chroma, diffuse[:, None]], 1)
+        blocks.append({"lobes": lobes, "peaks": peaks, "colour": colour} | further)
+        fits.append(result)
+    maps = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+    maps = {name: stored(name, array.reshape(rows, columns, -1), storage) for name, array in maps.items()}
+    everything = BatchFit(*(np.concatenate([getattr(f, name) for f in fits]) for name in BatchFit.__dataclass_fields__))
+    meta = base_meta(method, btf, parameters, filter_type=filter_type)
+    meta["constants"] = analytic.edge_constants(btf) | {"n_lobes": parameters["lobes"]}
+    failed = np.flatnonzero(~everything.converged)
+    meta["fit"] = everything.summary | {"not_converged_at": failed[:1000].tolist()}
+    return maps | direction_arrays(btf.views, btf.lights), meta

@@ -1,0 +1,129 @@
+"""Lafortune lobes times a view-dependent factor from a table per texel: the baseline "SLAF" of reflectance fields.
+
+Sources: K. Daubert et al., "Efficient Cloth Modeling and Rendering", EGWR 2001, eq. 4: the factor stands for what the texel
+shows of itself to a view (self-occlusion); Meseth, Müller, Klein 2004, Table 1. Lobes: see
+:mod:`btfref.representations.lafortune`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from btfref.representations import analytic, lafortune
+from btfref.representations.lookup import packed_arrays, positive_integer
+
+#: "paper": Table 1's four lobes, in floats.
+PRESETS = {"paper": {"lobes": 4, "storage": "float"}}
+
+#: Largest factor; a texel that the model misses altogether from one view must not make it grow without limit.
+FACTOR_BOUND = 8.0
+
+
+@dataclass(frozen=True)
+class Representation:
+    """Maps of :class:`btfref.representations.lafortune.Representation` and ``factor`` [row, column, view]."""
+
+    maps: dict
+    meta: dict
+
+    def evaluate(self, uv, w_light, w_view, *, lod=0.0):
+        """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored. Never negative.
+
+        The factor is interpolated over views as tables are; the lobes are evaluated at the view itself.
+        """
+        maps = lafortune.flat_maps(self.maps)
+
+        def kernel(s):
+            factor = np.einsum("ntv,nv->nt", maps["factor"][s.texel[:, :, None], s.view[:, None, :]], s.view_weight)
+            value = factor * lafortune.texel_values(maps, s)
+            return np.einsum("nt,ntc,nt->nc", s.texel_weight, maps["colour"][s.texel, :3], value)
+
+        return analytic.evaluate_analytic(self, kernel, uv, w_light, w_view)
+
+    def luminance_tables(self, texels, views):
+        """Model of luminance at measured views and all measured lights, shape (n, n_views, n_lights)."""
+        factor = self.maps["factor"].reshape(-1, self.maps["factor"].shape[-1])[texels[:, None], views]
+        return factor[..., None].astype(np.float32) * lafortune.luminance_tables(self.maps, texels, views)
+
+    def arrays(self):
+        """``lobes``, ``peaks``, ``colour``, ``factor`` and the direction tables."""
+        return self.maps
+
+    def port_arrays(self):
+        """As stored: a lobe is one texel; the factors of a texel are contiguous."""
+        return packed_arrays(self.maps)
+
+    def sampling_tables(self):
+        """Groups of texels alike, and their means."""
+        return analytic.sampling_tables(self)
+
+    @classmethod
+    def from_arrays(cls, arrays, meta):
+        return cls(arrays, meta)
+
+
+def fit(btf, *, seed=0, progress=None, lobes=4, rounds=1, storage="half", filter_type="bilinear"):
+    """Fit lobes, then the factor in closed form, then lobes with that factor, and so on.
+
+    Parameters
+    ----------
+    btf : SampledBTF
+    seed : int
+        Unused: nothing is random.
+    progress : callable, optional
+        ``progress(done, total, label)``.
+    lobes : int
+        Per texel, at least 1.
+    rounds : int
+        Refits of the lobes after the first fit; the factor is updated after each. At least 1.
+    storage : {"half", "float"}
+    filter_type : {"bilinear", "nearest"}
+
+    Returns
+    -------
+    Representation
+        ``meta["fit"]`` as for :func:`btfref.representations.lafortune.fit`.
+
+    Raises
+    ------
+    InputError
+        For parameters out of range, or values that are not finite or do not fit ``storage``.
+    MissingDependencyError
+        Without LLVM or CUDA.
+    """
+    n_lobes, rounds = positive_integer("lobes", lobes), positive_integer("rounds", rounds)
+
+    def fit_block(luminance):
+        result = lafortune.fit_lafortune(luminance, btf.views, btf.lights, n_lobes)
+        factor = view_factor(luminance, result.parameters, btf)
+        for _ in range(rounds):
+            result = lafortune.fit_lafortune(
+                luminance, btf.views, btf.lights, n_lobes, start=result.parameters, factor=factor
+            )
+            factor = view_factor(luminance, result.parameters, btf)
+        return result, {"factor": factor.T}
+
+    parameters = {"lobes": n_lobes, "rounds": rounds, "storage": storage, "seed": seed}
+    maps, meta = lafortune.fit_texels("lafortune_lut", btf, fit_block, parameters, progress, storage, filter_type)
+    result = Representation(maps, meta)
+    meta["fit"]["epsilon"] = analytic.fit_report(result, btf)
+    return result
+
+
+def view_factor(luminance, parameters, btf):
+    """Least-squares factor of each view and texel, ``Σ_l B M / Σ_l M²`` in [0, 8]; 1 where the model is 0."""
+    lobes, peaks, diffuse = lafortune.lobe_maps(parameters)
+    colour = np.pad(diffuse[:, None], ((0, 0), (3, 0)))
+    maps = {"lobes": lobes, "peaks": peaks, "colour": colour}
+    maps |= {"light_directions": btf.lights.vectors, "view_directions": btf.views.vectors}
+    texels = np.arange(len(parameters))
+    factor = np.ones(luminance.shape[::2], np.float32)
+    for view in range(len(factor)):
+        model = lafortune.luminance_tables(maps, texels, np.array([view]))[:, 0]
+        square = np.einsum("nl,nl->n", model, model)
+        product = np.einsum("ln,nl->n", luminance[view], model)
+        known = square > 1e-20
+        factor[view, known] = np.clip(product[known] / square[known], 0, FACTOR_BOUND)
+    return factor

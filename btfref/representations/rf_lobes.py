@@ -1,0 +1,284 @@
+"""Reflectance fields as a diffuse term and a few cosine lobes per texel and measured view.
+
+Source: J. Meseth, G. Müller, R. Klein, "Reflectance Field Based Real-Time, High-Quality Rendering of Bidirectional
+Texture Functions", Computers & Graphics 2004, eq. 1 ("RFNL"): ``ρ_d(x) + ρ_{s,v}(x) Σ_j (t_{v,j}(x) · l)^{n_{v,j}(x)}`` of
+luminance, times the texel's chroma.
+
+Differs from eq. 1 in two points. The data hold the cosine of the light, so the diffuse term is ``ρ_d l_z``, which is what
+eq. 4 makes of it; the lobes are fitted to the data as they are. And a lobe is stored as unit axis, exponent and peak
+``ρ_s ‖t‖^n`` instead of ``ρ_s`` and ``t``: the same functions, but no stored number can overflow when it is raised to a
+power.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from btfref.numerics.levenberg import fit_batch
+from btfref.numerics.powers import FLOOR, unit_lobe
+from btfref.representations import analytic
+from btfref.representations.lookup import base_meta, direction_arrays, packed_arrays, positive_integer, stored
+from btfref.representations.lobe_start import exponent_limit, lobe_starts
+
+#: "paper": two lobes in floats.
+PRESETS = {"paper": {"lobes": 2, "storage": "float"}}
+
+#: Parabolic coordinates of a lobe's axis stay within ± this: axes may dip below the horizon, where raised structure
+#: keeps brightening towards grazing light, but not reach the pole of the map.
+AXIS_BOUND = 1.5
+
+#: Least exponent: below 1 a lobe's slope is infinite where it ends, and no interpolation of rounded numbers agrees.
+LEAST_EXPONENT = 1.0
+
+#: Largest peak of a lobe relative to the brightest sample of its fit. An axis midway between samples, at the largest
+#: exponent, needs 2; axes beyond the samples more.
+PEAK_BOUND = 4.0
+
+#: The diffuse albedo of a texel is this quantile of luminance / l_z over its samples: what is there almost always.
+#: Lobes add to it and cannot take away.
+DIFFUSE_QUANTILE = 0.1
+
+
+@dataclass(frozen=True)
+class Representation:
+    """``lobes`` [row, column, view, 4 k]: parabolic axis (s, t), exponent, peak of each; ``colour`` [row, column, 4]:
+    chroma and diffuse albedo ρ_d in 1/sr; and the direction tables.
+    """  # noqa: D205
+
+    maps: dict
+    meta: dict
+
+    def evaluate(self, uv, w_light, w_view, *, lod=0.0):
+        """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored. Never negative."""
+        lobes = self._lobes()
+        colour = self.maps["colour"].reshape(-1, 4).astype(float)
+
+        def kernel(s):
+            index = (s.texel[:, :, None], s.view[:, None, :])
+            value = lobe_sum(lobes[index].astype(float), s.w_light[:, None, None, None])
+            value = np.einsum("ntv,nt,nv->nt", value, s.texel_weight, s.view_weight)
+            at = colour[s.texel]
+            value += s.texel_weight * at[..., 3] * s.w_light[:, None, 2]
+            return np.einsum("nt,ntc->nc", value, at[..., :3])
+
+        return analytic.evaluate_analytic(self, kernel, uv, w_light, w_view)
+
+    def _lobes(self):
+        """Lobes by flat texel and view, shape (n_texels, n_views, k, 4)."""
+        lobes = self.maps["lobes"]
+        return lobes.reshape(-1, lobes.shape[2], lobes.shape[3] // 4, 4)
+
+    def luminance_tables(self, texels, views):
+        """Model of luminance at measured views and all measured lights, shape (n, n_views, n_lights)."""
+        lights = self.maps["light_directions"].astype(np.float32)
+        s, t, exponent, peak = np.moveaxis(self._lobes()[texels[:, None], views].astype(np.float32), -1, 0)
+        axis = parabolic_axis(s, t)
+        colour = self.maps["colour"].reshape(-1, 4).astype(np.float32)[texels]
+        result = colour[:, 3, None, None] * lights[:, 2]
+        for j in range(s.shape[-1]):
+            cosine = np.maximum(axis[:, :, j] @ lights.T, np.float32(FLOOR))
+            result = result + peak[:, :, j, None] * np.exp2(exponent[:, :, j, None] * np.log2(np.minimum(cosine, 1)))
+        return result
+
+    def arrays(self):
+        """``lobes``, ``colour`` and the direction tables."""
+        return self.maps
+
+    def port_arrays(self):
+        """As stored: a lobe is one texel."""
+        return packed_arrays(self.maps)
+
+    def sampling_tables(self):
+        """Groups of texels alike, and their means."""
+        return analytic.sampling_tables(self)
+
+    @classmethod
+    def from_arrays(cls, arrays, meta):
+        return cls(arrays, meta)
+
+
+def parabolic_axis(s, t):
+    """Unit vectors of parabolic coordinates, on the whole sphere but for its lower pole; (...) -> (..., 3)."""
+    r2 = s * s + t * t
+    return np.stack([2 * s, 2 * t, 1 - r2], -1) / (1 + r2)[..., None]
+
+
+def lobe_sum(lobes, w_light):
+    """``Σ_j peak_j (axis_j · l)^{n_j}``; (..., k, 4), (..., 1, 3) -> (...)."""
+    s, t, exponent, peak = np.moveaxis(lobes, -1, 0)
+    return (peak * unit_lobe(parabolic_axis(s, t), w_light, exponent)).sum(-1)
+
+
+def lobe_residual(module, luminance, lights, n_lobes):
+    """Residual and Jacobian of lobes for :func:`fit_batch`.
+
+    Parameters
+    ----------
+    module : module
+        Of :func:`btfref.numerics.levenberg.backend`.
+    luminance : ndarray of float32, shape (n_lights, N)
+        Data of N fits.
+    lights : ndarray, shape (n_lights, 3)
+    n_lobes : int
+
+    Returns
+    -------
+    callable
+        Parameters of each lobe: s, t, natural logarithm of the exponent, peak.
+    """
+    import drjit as dr
+
+    Float = module.Float
+    n = luminance.shape[1]
+    data = Float(np.ascontiguousarray(luminance).ravel())
+    table = Float(np.pad(np.asarray(lights, np.float32), ((0, 0), (0, 1))).ravel())
+
+    def residual(p, lane, sample):
+        x, y, z, _ = dr.gather(module.Array4f, table, sample)
+        r = -dr.gather(Float, data, dr.fma(sample, n, lane))
+        row = []
+        for j in range(n_lobes):
+            s, t, log_exponent, peak = p[4 * j : 4 * j + 4]
+            scale = dr.rcp(1 + s * s + t * t)
+            # The axis is (2 s, 2 t, 2 − D) / D with D = 1 + s² + t².
+            cosine = (2 * (s * x + t * y) + 2 * z) * scale - z
+            there = cosine > FLOOR
+            exponent = dr.exp(log_exponent)
+            safe = dr.select(there, cosine, 1)
+            log = dr.log2(safe)
+            power = dr.select(there, dr.exp2(exponent * log), 0)
+            value = peak * power
+            r += value
+            slope = 2 * scale * dr.select(there, value * exponent / safe, 0)
+            along = cosine + z
+            row += [slope * (x - s * along), slope * (y - t * along), value * exponent * log * 0.6931471805599453, power]
+        return r, row
+
+    return residual
+
+
+def fit(
+    btf, *, seed=0, progress=None, lobes=2, diffuse_quantile=DIFFUSE_QUANTILE, storage="half", filter_type="bilinear"
+):
+    """Fit lobes to ``btf`` by batched Levenberg–Marquardt.
+
+    Fits that do not converge from the first start are repeated from a second one with twice the iterations; the better
+    result is kept, and those that still have not converged are listed.
+
+    Parameters
+    ----------
+    btf : SampledBTF
+    seed : int
+        Unused: nothing is random.
+    progress : callable, optional
+        ``progress(done, total, label)``.
+    lobes : int
+        Per texel and view, at least 1.
+    diffuse_quantile : float
+        Quantile of luminance / l_z that becomes the diffuse albedo of a texel.
+    storage : {"half", "float"}
+    filter_type : {"bilinear", "nearest"}
+
+    Returns
+    -------
+    Representation
+        ``meta["fit"]`` holds ``epsilon`` (see :func:`analytic.fit_report`), the counts of
+        :attr:`btfref.numerics.levenberg.BatchFit.summary`, and ``not_converged_at``: up to 1000 pairs (texel, view).
+
+    Raises
+    ------
+    InputError
+        For parameters out of range, or values that are not finite or do not fit ``storage``.
+    MissingDependencyError
+        Without LLVM or CUDA.
+    """
+    n_lobes = positive_integer("lobes", lobes)
+    n_views, _, rows, columns, _ = btf.values.shape
+    maps = {
+        "lobes": np.zeros((rows * columns, n_views, 4 * n_lobes), np.float32),
+        "colour": np.zeros((rows * columns, 4), np.float32),
+    }
+    summaries, failed = [], []
+    for part, luminance, chroma in analytic.luminance_blocks(btf, progress, "lobes"):
+        diffuse = diffuse_albedo(luminance, btf.lights.vectors, diffuse_quantile)
+        data = luminance - (diffuse * btf.lights.vectors[:, 2, None]).astype(np.float32)
+        n = data.shape[2]
+        result = fit_lobes(np.moveaxis(data, 1, 0).reshape(len(btf.lights), -1), btf.lights, n_lobes)
+        parameters = result.parameters.reshape(n_views, n, 4 * n_lobes)
+        parameters[..., 2::4] = np.exp(parameters[..., 2::4])
+        maps["lobes"][part] = parameters.swapaxes(0, 1)
+        maps["colour"][part] = np.concatenate([chroma, diffuse[:, None]], 1)
+        summaries.append(result.summary)
+        view, texel = np.divmod(np.flatnonzero(~result.converged), n)
+        failed += np.stack([texel + part.start, view], 1).tolist()
+    shapes = {"lobes": (rows, columns, n_views, -1), "colour": (rows, columns, 4)}
+    maps = {name: stored(name, array.reshape(shapes[name]), storage) for name, array in maps.items()}
+    parameters = {"lobes": n_lobes, "diffuse_quantile": diffuse_quantile, "storage": storage, "seed": seed}
+    meta = base_meta("rf_lobes", btf, parameters, filter_type=filter_type)
+    meta["constants"] = analytic.edge_constants(btf) | {"n_lobes": n_lobes}
+    result = Representation(maps | direction_arrays(btf.views, btf.lights), meta)
+    meta["fit"] = merged(summaries) | {"not_converged_at": failed[:1000], "epsilon": analytic.fit_report(result, btf)}
+    return result
+
+
+def merged(summaries):
+    """One summary of several batches."""
+    fits = sum(s["fits"] for s in summaries)
+    result = {key: sum(s[key] for s in summaries) for key in ("fits", "converged", "not_converged")}
+    result["ends"] = {kind: sum(s["ends"][kind] for s in summaries) for kind in summaries[0]["ends"]}
+    result["mean_iterations"] = sum(s["mean_iterations"] * s["fits"] for s in summaries) / max(fits, 1)
+    return result
+
+
+def diffuse_albedo(luminance, lights, quantile):
+    """ρ_d of each texel: a quantile of luminance / l_z; (n_views, n_lights, n) -> (n,)."""
+    # Grazing lights would amplify noise: 0.2 leaves out what is below 78 degrees.
+    high = lights[:, 2] > 0.2
+    if not high.any():
+        return np.zeros(luminance.shape[2])
+    ratio = luminance[:, high] / lights[high, 2, None].astype(np.float32)
+    return np.maximum(np.quantile(ratio.reshape(-1, ratio.shape[2]), quantile, axis=0, overwrite_input=True), 0)
+
+
+def fit_lobes(data, lights, n_lobes, *, iterations=100, restart=True):
+    """Lobes of N reflectance fields.
+
+    Parameters
+    ----------
+    data : ndarray of float32, shape (n_lights, N)
+        Luminance without its diffuse term.
+    lights : DirectionSet
+    n_lobes : int
+    iterations : int
+    restart : bool
+        Whether fits that have not converged try the second start.
+
+    Returns
+    -------
+    btfref.numerics.levenberg.BatchFit
+        Parameters (s, t, natural logarithm of the exponent, peak) of each lobe.
+    """
+    from btfref.numerics.levenberg import backend
+
+    module = backend()
+    peak = PEAK_BOUND * np.maximum(data.max(0), 0)[:, None]
+    limit = np.log(exponent_limit(lights))
+    ones = np.ones_like(peak)
+    lower = np.tile(np.concatenate([-AXIS_BOUND * ones, -AXIS_BOUND * ones, np.log(LEAST_EXPONENT) * ones, 0 * ones], 1), n_lobes)
+    upper = np.tile(np.concatenate([AXIS_BOUND * ones, AXIS_BOUND * ones, limit * ones, peak], 1), n_lobes)
+
+    def run(columns, start, steps):
+        residual = lobe_residual(module, data[:, columns], lights.vectors, n_lobes)
+        return fit_batch(residual, start, lower[columns], upper[columns], len(lights), iterations=steps)
+
+    result = run(slice(None), lobe_starts(data, lights.vectors, n_lobes), iterations)
+    again = np.flatnonzero(~result.converged) if restart else []
+    if len(again):
+        start = lobe_starts(data[:, again], lights.vectors, n_lobes, high_pass=False)
+        second = run(again, start, 2 * iterations)
+        better = second.converged | (second.cost < result.cost[again])
+        for name in ("parameters", "cost", "status", "iterations"):
+            getattr(result, name)[again[better]] = getattr(second, name)[better]
+    return result

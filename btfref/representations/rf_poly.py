@@ -1,0 +1,141 @@
+"""Reflectance fields as biquadratic polynomials: one per texel and measured view.
+
+Sources: J. Meseth, G. Müller, R. Klein, "Reflectance Field Based Real-Time, High-Quality Rendering of Bidirectional
+Texture Functions", Computers & Graphics 2004, section 4 ("RFP"); T. Malzbender, D. Gelb, H. Wolters, "Polynomial Texture
+Maps", SIGGRAPH 2001, eq. 2: ``a0 l_x² + a1 l_y² + a2 l_x l_y + a3 l_x + a4 l_y + a5`` for luminance, times the texel's
+chroma.
+
+Differs from that equation in its basis: ``a5 l_z²`` stands in place of ``a5``. On the sphere ``1 = l_x² + l_y² + l_z²``, so the
+functions are the same, but at grazing light, where they are small, large terms do not have to cancel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from btfref.representations import analytic
+from btfref.representations.lookup import base_meta, direction_arrays, packed_arrays, stored
+
+#: "paper": all 81 views in floats.
+PRESETS = {"paper": {"storage": "float"}}
+
+#: Singular values below this share of the largest are dropped: float32 data cannot tell such a combination of the
+#: six terms from zero.
+CUTOFF = 1e-5
+
+
+def terms(w_light):
+    """The six terms of the polynomial, shape (..., 3) -> (..., 6)."""
+    x, y, z = np.moveaxis(w_light, -1, 0)
+    return np.stack([x * x, y * y, x * y, x, y, z * z], -1)
+
+
+@dataclass(frozen=True)
+class Representation:
+    """``polynomial`` [row, column, view, 6], ``chroma`` [row, column, 3], and the direction tables."""
+
+    maps: dict
+    meta: dict
+
+    def evaluate(self, uv, w_light, w_view, *, lod=0.0):
+        """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored.
+
+        May be negative where a polynomial undershoots.
+        """
+        polynomial = self.maps["polynomial"]
+        polynomial = polynomial.reshape(-1, *polynomial.shape[2:])
+        chroma = self.maps["chroma"].reshape(-1, 3).astype(float)
+
+        def kernel(s):
+            coefficient = polynomial[s.texel[:, :, None], s.view[:, None, :]].astype(float)
+            value = np.einsum("ntvk,nk->ntv", coefficient, terms(s.w_light))
+            value = np.einsum("ntv,nt,nv->nt", value, s.texel_weight, s.view_weight)
+            return np.einsum("nt,ntc->nc", value, chroma[s.texel])
+
+        return analytic.evaluate_analytic(self, kernel, uv, w_light, w_view)
+
+    def luminance_tables(self, texels, views):
+        """Model of luminance at measured views and all measured lights, shape (n, n_views, n_lights)."""
+        polynomial = self.maps["polynomial"]
+        coefficient = polynomial.reshape(-1, *polynomial.shape[2:])[texels[:, None], views].astype(np.float32)
+        return coefficient @ terms(self.maps["light_directions"].astype(np.float32)).T
+
+    def arrays(self):
+        """``polynomial``, ``chroma`` and the direction tables."""
+        return self.maps
+
+    def port_arrays(self):
+        """As stored; the six coefficients fill two texels."""
+        return packed_arrays(self.maps)
+
+    def sampling_tables(self):
+        """Groups of texels alike, and their means."""
+        return analytic.sampling_tables(self)
+
+    @classmethod
+    def from_arrays(cls, arrays, meta):
+        return cls(arrays, meta)
+
+
+def light_operator(lights):
+    """The pseudo-inverse of the terms at the measured lights.
+
+    Parameters
+    ----------
+    lights : ndarray, shape (n_lights, 3)
+
+    Returns
+    -------
+    operator : ndarray of float64, shape (6, n_lights)
+        Of least norm where the lights do not determine all six coefficients, as when they lie on one ring.
+    report : dict
+        ``rank`` and ``condition``, the ratio of the largest to the smallest singular value that is kept.
+    """
+    u, singular, vt = np.linalg.svd(terms(np.asarray(lights, float)), full_matrices=False)
+    kept = singular > CUTOFF * singular[0]
+    inverse = np.where(kept, 1 / np.where(kept, singular, 1), 0)
+    return (vt.T * inverse) @ u.T, {"rank": int(kept.sum()), "condition": float(singular[0] / singular[kept][-1])}
+
+
+def fit(btf, *, seed=0, progress=None, storage="half", filter_type="bilinear"):
+    """Least-squares polynomials of ``btf`` in closed form.
+
+    Parameters
+    ----------
+    btf : SampledBTF
+    seed : int
+        Unused: nothing is random.
+    progress : callable, optional
+        ``progress(done, total, label)``.
+    storage : {"half", "float"}
+    filter_type : {"bilinear", "nearest"}
+
+    Returns
+    -------
+    Representation
+        ``meta["fit"]`` holds ``epsilon`` (see :func:`analytic.fit_report`), ``rank`` and ``condition``.
+
+    Raises
+    ------
+    InputError
+        For values that are not finite or do not fit ``storage``.
+    """
+    # All views share the measured lights, hence one operator.
+    operator, conditioning = light_operator(btf.lights.vectors)
+    n_views, _, rows, columns, _ = btf.values.shape
+    polynomial = np.zeros((rows * columns, n_views, 6), np.float32)
+    chroma = np.zeros((rows * columns, 3))
+    for part, luminance, colour in analytic.luminance_blocks(btf, progress, "polynomials"):
+        polynomial[part] = np.einsum("kl,vln->nvk", operator.astype(np.float32), luminance, optimize=True)
+        chroma[part] = colour
+    maps = {
+        "polynomial": stored("polynomial", polynomial.reshape(rows, columns, n_views, 6), storage),
+        "chroma": stored("chroma", chroma.reshape(rows, columns, 3), storage),
+    }
+    meta = base_meta("rf_poly", btf, {"storage": storage, "seed": seed}, filter_type=filter_type)
+    meta["constants"] = analytic.edge_constants(btf)
+    result = Representation(maps | direction_arrays(btf.views, btf.lights), meta)
+    meta["fit"] = conditioning | {"epsilon": analytic.fit_report(result, btf)}
+    return result

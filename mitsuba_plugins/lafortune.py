@@ -1,0 +1,50 @@
+"""Dr.Jit port of :mod:`btfref.representations.lafortune`."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_plugins.analytic import held, packet, safe_power
+from mitsuba_plugins.lookup import texel_stencil
+
+
+class Evaluator:
+    """Evaluates the lobes of the neighbouring texels."""
+
+    def __init__(self, maps):
+        self.views = maps.views
+        self.shape, self.filter_type = maps.shape, maps.filter_type
+        constants = maps.meta["constants"]
+        self.light_edge, self.view_edge = constants["light_edge"], constants["view_edge"]
+        self.n_lobes = constants["n_lobes"]
+        self.update(maps)
+
+    def update(self, maps):
+        """Take over changed maps."""
+        self.width = maps.tensors["peaks"].shape[-1]
+        for name in ("lobes", "peaks", "colour"):
+            setattr(self, name, mi.Float(maps.tensors[name].array))
+        dr.eval(self.lobes, self.peaks, self.colour)
+
+    def factor(self, texel, views, active):
+        """View-dependent factor of a texel: 1."""
+        return mi.Float(1)
+
+    def evaluate(self, uv, w_light, w_view, active):
+        """B in 1/sr for valid directions; never negative."""
+        l, fade = held(w_light, self.light_edge)
+        v, _ = held(w_view, self.view_edge)
+        product = l * v
+        views = self.views.stencil(w_view)
+        total = mi.Color3f(0)
+        for texel, share in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True):
+            red, green, blue, value = packet(self.colour, texel, 4, active)
+            peaks = packet(self.peaks, texel, self.width, active)
+            lobes = packet(self.lobes, texel, 4 * self.n_lobes, active)
+            for j in range(self.n_lobes):
+                base = dr.dot(mi.Vector3f(*lobes[4 * j : 4 * j + 3]), product)
+                value = dr.fma(peaks[j], safe_power(base, lobes[4 * j + 3]), value)
+            value *= share * self.factor(texel, views, active)
+            total += value * mi.Color3f(red, green, blue)
+        return total * (fade * l.z)

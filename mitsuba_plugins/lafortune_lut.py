@@ -1,0 +1,26 @@
+"""Dr.Jit port of :mod:`btfref.representations.lafortune_lut`."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_plugins import lafortune
+from mitsuba_plugins.analytic import single
+
+
+class Evaluator(lafortune.Evaluator):
+    """Lobes times the interpolated factor of the view."""
+
+    def update(self, maps):
+        """Take over changed maps."""
+        super().update(maps)
+        self.factors, self.stride = mi.Float(maps.tensors["factor"].array), maps.tensors["factor"].shape[-1]
+        dr.eval(self.factors)
+
+    def factor(self, texel, views, active):
+        """View-dependent factor of a texel."""
+        total = mi.Float(0)
+        for view, weight in single(views):
+            total = dr.fma(dr.gather(mi.Float, self.factors, texel * self.stride + view, active), weight, total)
+        return total

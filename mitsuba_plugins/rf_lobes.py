@@ -1,0 +1,42 @@
+"""Dr.Jit port of :mod:`btfref.representations.rf_lobes`."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_plugins.analytic import held, packet, parabolic_axis, single, unit_lobe
+from mitsuba_plugins.lookup import texel_stencil
+
+
+class Evaluator:
+    """Evaluates the lobes of the neighbouring texels and views."""
+
+    def __init__(self, maps):
+        self.views, self.n_views = maps.views, maps.tensors["lobes"].shape[2]
+        self.shape, self.filter_type = maps.shape, maps.filter_type
+        constants = maps.meta["constants"]
+        self.edge, self.n_lobes = constants["light_edge"], constants["n_lobes"]
+        self.update(maps)
+
+    def update(self, maps):
+        """Take over changed maps."""
+        self.lobes = mi.Float(maps.tensors["lobes"].array)
+        self.colour = mi.Float(maps.tensors["colour"].array)
+        dr.eval(self.lobes, self.colour)
+
+    def evaluate(self, uv, w_light, w_view, active):
+        """B in 1/sr for valid directions; never negative."""
+        l, fade = held(w_light, self.edge)
+        views = single(self.views.stencil(w_view))
+        total = mi.Color3f(0)
+        for texel, share in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True):
+            red, green, blue, diffuse = packet(self.colour, texel, 4, active)
+            value = diffuse * l.z
+            for view, weight in views:
+                lobes = packet(self.lobes, texel * self.n_views + view, 4 * self.n_lobes, active)
+                for j in range(self.n_lobes):
+                    s, t, exponent, peak = lobes[4 * j : 4 * j + 4]
+                    value = dr.fma(peak * weight, unit_lobe(parabolic_axis(s, t), l, exponent), value)
+            total += (value * share) * mi.Color3f(red, green, blue)
+        return total * fade

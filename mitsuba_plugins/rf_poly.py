@@ -1,0 +1,43 @@
+"""Dr.Jit port of :mod:`btfref.representations.rf_poly`."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_plugins.analytic import held, packet, single
+from mitsuba_plugins.lookup import texel_stencil
+
+
+class Evaluator:
+    """Evaluates the polynomials of the neighbouring texels and views."""
+
+    def __init__(self, maps):
+        self.views, self.n_views = maps.views, maps.tensors["polynomial"].shape[2]
+        self.shape, self.filter_type = maps.shape, maps.filter_type
+        self.edge = maps.meta["constants"]["light_edge"]
+        self.update(maps)
+
+    def update(self, maps):
+        """Take over changed maps."""
+        self.polynomial = mi.Float(maps.tensors["polynomial"].array)
+        self.chroma = mi.Float(maps.tensors["chroma"].array)
+        dr.eval(self.polynomial, self.chroma)
+
+    def evaluate(self, uv, w_light, w_view, active):
+        """B in 1/sr for valid directions; may be negative."""
+        l, fade = held(w_light, self.edge)
+        terms = [l.x * l.x, l.y * l.y, l.x * l.y, l.x, l.y, l.z * l.z]
+        views = single(self.views.stencil(w_view))
+        total = mi.Color3f(0)
+        for texel, share in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True):
+            value = mi.Float(0)
+            for view, weight in views:
+                a = packet(self.polynomial, texel * self.n_views + view, 8, active)
+                one = mi.Float(0)
+                for coefficient, term in zip(a, terms, strict=False):
+                    one = dr.fma(coefficient, term, one)
+                value = dr.fma(one, weight, value)
+            colour = packet(self.chroma, texel, 4, active)
+            total += (value * share) * mi.Color3f(*colour[:3])
+        return total * fade

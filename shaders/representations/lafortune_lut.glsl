@@ -1,0 +1,35 @@
+// Provides btf_eval of Lafortune lobes times a view-dependent factor per texel.
+// Expects the maps of lib/lafortune.glsl, factor [row, column, view], LIGHT_EDGE, VIEW_EDGE and the direction tables.
+
+#include "lib/directions.glsl"
+#include "lib/hold.glsl"
+#include "lib/lafortune.glsl"
+#include "lib/texels.glsl"
+
+uniform sampler2DArray factor;
+
+vec3 btf_eval(vec2 uv, vec3 w_light, vec3 w_view, float lod) {
+    if (!directions_valid(w_light, w_view)) {
+        return vec3(0.0);
+    }
+    Stencil texels = texel_stencil(uv, COLOUR_DIM0, COLOUR_DIM1);
+    Stencil views = view_stencil(w_view);
+    float fade, unused;
+    vec3 l = held(w_light, LIGHT_EDGE, fade);
+    vec3 product = l * held(w_view, VIEW_EDGE, unused);
+    vec3 sum = vec3(0.0);
+    for (int x = 0; x < 4; ++x) {
+        if (texels.weight[x] == 0.0) {
+            continue;
+        }
+        // Daubert et al. 2001, eq. 4: the factor stands for self-occlusion.
+        float visible = 0.0;
+        for (int v = 0; v < 4; ++v) {
+            int at = texels.index[x] * FACTOR_STRIDE + (views.index[v] >> 2);
+            visible += views.weight[v] * table_fetch(factor, at)[views.index[v] & 3];
+        }
+        vec4 own = table_fetch(colour, texels.index[x] * COLOUR_STRIDE);
+        sum += texels.weight[x] * visible * lafortune_value(texels.index[x], own.a, product) * own.rgb;
+    }
+    return fade * l.z * sum;
+}
