@@ -140,7 +140,11 @@ class _Solver:
 
     def __init__(self, residual, first, start, lower, upper, n_samples, tolerances):
         self.module = backend()
-        self.residual, self.n_samples, self.first = residual, n_samples, first
+        import drjit as dr
+
+        # Opaque numbers: one kernel serves batches of any size.
+        self.residual = residual
+        self.n_samples, self.first = (dr.opaque(self.module.UInt32, k) for k in (n_samples, first))
         self.tolerances = tolerances
         self.size, self.width = start.shape
         Float, UInt32 = self.module.Float, self.module.UInt32
@@ -150,15 +154,14 @@ class _Solver:
         self.out_cost = Float(np.zeros(self.size, np.float32))
         self.out_status = UInt32(np.zeros(self.size, np.uint32))
         self.out_count = UInt32(np.zeros(self.size, np.uint32))
-        import drjit as dr
-
         lane = dr.arange(UInt32, self.size)
         p = columns(start)
         cost, gradient, hessian = self._normal_equations(p, lane)
         damping, growth = dr.full(Float, _FIRST_DAMPING, self.size), dr.full(Float, 2.0, self.size)
         status = dr.zeros(UInt32, self.size)
         self.state = [p, cost, gradient, hessian, damping, growth, status, dr.zeros(UInt32, self.size), lane]
-        dr.eval(self.state)
+        # Literals would be compiled into the first kernels, and differ from those of later steps.
+        dr.make_opaque(self.state)
 
     def run(self, iterations, progress):
         """Iterate until all lanes have ended or the iterations are used up."""

@@ -131,7 +131,7 @@ def lobe_residual(module, luminance, lights, n_lobes):
     import drjit as dr
 
     Float = module.Float
-    n = luminance.shape[1]
+    n = dr.opaque(module.UInt32, luminance.shape[1])
     data = Float(np.ascontiguousarray(luminance).ravel())
     table = Float(np.pad(np.asarray(lights, np.float32), ((0, 0), (0, 1))).ravel())
 
