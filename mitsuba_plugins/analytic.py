@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from btfref.numerics.powers import FLOOR, LIMIT_LOG2, LOWEST_LOG2
 
-#: log2(1 + f) comes from a series in f / (2 + f) below this |f|: there 1 + f would round what a large exponent multiplies.
+#: Below this |f|, log2(1 + f) comes from a series in f / (2 + f): 1 + f would round what a large exponent multiplies.
 _NEAR_ONE = 0.29
 
 
@@ -30,19 +30,19 @@ def safe_power(base, exponent):
     return _from_log(dr.log2(dr.select(there, base, 1)), exponent, there)
 
 
-def lobe_power(t, l, n):
+def lobe_power(t, light, n):
     """As :func:`btfref.numerics.powers.lobe_power`."""
     scale = dr.maximum(dr.maximum(dr.abs(t.x), dr.abs(t.y)), dr.abs(t.z))
     there = scale >= FLOOR
     scale = dr.select(there, scale, 1)
-    cosine = dr.dot(dr.select(there, t, 0) / scale, l)
+    cosine = dr.dot(dr.select(there, t, 0) / scale, light)
     there &= cosine >= FLOOR
     return _from_log(dr.log2(scale) + dr.log2(dr.select(there, cosine, 1)), n, there)
 
 
-def unit_lobe(axis, l, n):
+def unit_lobe(axis, light, n):
     """As :func:`btfref.numerics.powers.unit_lobe`."""
-    h = 0.5 * dr.squared_norm(axis - l)
+    h = 0.5 * dr.squared_norm(axis - light)
     there = 1 - h >= FLOOR
     near = h < _NEAR_ONE
     far = dr.log2(dr.select(there & ~near, 1 - h, 1))

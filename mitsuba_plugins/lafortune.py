@@ -33,9 +33,9 @@ class Evaluator:
 
     def evaluate(self, uv, w_light, w_view, active):
         """B in 1/sr for valid directions; never negative."""
-        l, fade = held(w_light, self.light_edge)
+        light, fade = held(w_light, self.light_edge)
         v, _ = held(w_view, self.view_edge)
-        product = l * v
+        product = light * v
         views = self.views.stencil(w_view)
         total = mi.Color3f(0)
         for texel, share in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True):
@@ -47,4 +47,4 @@ class Evaluator:
                 value = dr.fma(peaks[j], safe_power(base, lobes[4 * j + 3]), value)
             value *= share * self.factor(texel, views, active)
             total += value * mi.Color3f(red, green, blue)
-        return total * (fade * l.z)
+        return total * (fade * light.z)

@@ -22,5 +22,7 @@ class Evaluator(lafortune.Evaluator):
         """View-dependent factor of a texel."""
         total = mi.Float(0)
         for view, weight in single(views):
-            total = dr.fma(dr.gather(mi.Float, self.factors, texel * self.stride + view, active), weight, total)
+            total = dr.fma(
+                dr.gather(mi.Float, self.factors, texel * self.stride + view, active), weight, total
+            )
         return total

@@ -27,16 +27,16 @@ class Evaluator:
 
     def evaluate(self, uv, w_light, w_view, active):
         """B in 1/sr for valid directions; never negative."""
-        l, fade = held(w_light, self.edge)
+        light, fade = held(w_light, self.edge)
         views = single(self.views.stencil(w_view))
         total = mi.Color3f(0)
         for texel, share in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True):
             red, green, blue, diffuse = packet(self.colour, texel, 4, active)
-            value = diffuse * l.z
+            value = diffuse * light.z
             for view, weight in views:
                 lobes = packet(self.lobes, texel * self.n_views + view, 4 * self.n_lobes, active)
                 for j in range(self.n_lobes):
                     s, t, exponent, peak = lobes[4 * j : 4 * j + 4]
-                    value = dr.fma(peak * weight, unit_lobe(parabolic_axis(s, t), l, exponent), value)
+                    value = dr.fma(peak * weight, unit_lobe(parabolic_axis(s, t), light, exponent), value)
             total += (value * share) * mi.Color3f(red, green, blue)
         return total * fade

@@ -26,8 +26,8 @@ class Evaluator:
 
     def evaluate(self, uv, w_light, w_view, active):
         """B in 1/sr for valid directions; may be negative."""
-        l, fade = held(w_light, self.edge)
-        terms = [l.x * l.x, l.y * l.y, l.x * l.y, l.x, l.y, l.z * l.z]
+        light, fade = held(w_light, self.edge)
+        terms = [light.x * light.x, light.y * light.y, light.x * light.y, light.x, light.y, light.z * light.z]
         views = single(self.views.stencil(w_view))
         total = mi.Color3f(0)
         for texel, share in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True):

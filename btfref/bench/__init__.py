@@ -5,6 +5,8 @@ from __future__ import annotations
 #: Suites by name: module with ``run(*, quick, progress, btf, only) -> dict`` and ``table(result) -> rows``.
 SUITES = {
     "fit": "btfref.bench.fit",
+    "lobes": "btfref.bench.lobes",
+    "reflectance": "btfref.bench.reflectance",
     "render": "btfref.bench.render",
     "synth": "btfref.bench.synth",
 }

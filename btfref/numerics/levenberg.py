@@ -30,6 +30,9 @@ LANES = 1 << 19
 _FIRST_DAMPING = 1e-2
 _TINY = 1e-30
 
+#: Share of the range of a parameter within which a step may end on the bound.
+_NEAR_BOUND = 2e-3
+
 
 @dataclass(frozen=True)
 class BatchFit:
@@ -90,7 +93,17 @@ def backend():
 
 
 def fit_batch(
-    residual, start, lower, upper, n_samples, *, iterations=100, gtol=1e-4, ftol=1e-6, xtol=1e-5, progress=None
+    residual,
+    start,
+    lower,
+    upper,
+    n_samples,
+    *,
+    iterations=100,
+    gtol=1e-4,
+    ftol=1e-6,
+    xtol=1e-5,
+    progress=None,
 ):
     """Minimise ``½ Σ_s r(p, lane, s)²`` over p within bounds, for each lane on its own.
 
@@ -122,14 +135,16 @@ def fit_batch(
     BatchFit
     """
     start = np.atleast_2d(np.asarray(start, np.float32))
-    n, width = start.shape
+    n = len(start)
     lower, upper = (np.broadcast_to(np.asarray(b, np.float32), start.shape) for b in (lower, upper))
     parameters = np.clip(start, lower, upper)
     cost, status = np.zeros(n, np.float32), np.zeros(n, np.uint8)
     count = np.zeros(n, np.uint16)
     for first in range(0, n, LANES):
         part = slice(first, min(first + LANES, n))
-        solver = _Solver(residual, first, parameters[part], lower[part], upper[part], n_samples, (gtol, ftol, xtol))
+        solver = _Solver(
+            residual, first, parameters[part], lower[part], upper[part], n_samples, (gtol, ftol, xtol)
+        )
         solver.run(iterations, (lambda done, first=first: progress(first + done, n)) if progress else None)
         parameters[part], cost[part], status[part], count[part] = solver.results()
     return BatchFit(parameters, cost, status, count)
@@ -236,16 +251,18 @@ class _Solver:
             ((p[i] <= low[i]) & (gradient[i] >= 0)) | ((p[i] >= high[i]) & (gradient[i] <= 0)) for i in width
         ]
         at = {}
-        for k, (i, j) in enumerate((i, j) for i in width for j in range(i, self.width)):
+        for k, (i, j) in enumerate(zip(*np.triu_indices(self.width), strict=True)):
             at[i, j] = at[j, i] = hessian[k]
         # Scaled to unit columns: float32 then suffices for the factorisation.
         scale = [dr.select(at[i, i] > _TINY, dr.rsqrt(dr.maximum(at[i, i], _TINY)), 0) for i in width]
         dead = [frozen[i] | (at[i, i] <= _TINY) for i in width]
         cosine = [dr.select(dead[i], 0, gradient[i] * scale[i]) for i in width]
         step = _damped_solution(dr, at, scale, dead, cosine, damping)
-        trial = [dr.clip(p[i] + step[i], low[i], high[i]) for i in width]
+        trial = [_towards(dr, p[i], step[i], low[i], high[i]) for i in width]
         step = [trial[i] - p[i] for i in width]
-        predicted = -sum(step[i] * (gradient[i] + 0.5 * sum(at[i, j] * step[j] for j in width)) for i in width)
+        predicted = -sum(
+            step[i] * (gradient[i] + 0.5 * sum(at[i, j] * step[j] for j in width)) for i in width
+        )
 
         new_cost, new_gradient, new_hessian = self._normal_equations(trial, lane)
         # NaN compares false: a trial that is not finite is rejected.
@@ -255,7 +272,9 @@ class _Solver:
         largest = sum_max(dr, [dr.abs(c) for c in cosine]) * dr.rsqrt(dr.maximum(2 * cost, _TINY))
         still = sum_max(dr, [dr.abs(step[i]) - xtol * (dr.abs(p[i]) + xtol) for i in width]) <= 0
         flat = (predicted <= ftol * cost) & (dr.abs(actual) <= ftol * cost)
-        ended = dr.select(cost <= _TINY, 4, dr.select(largest <= gtol, 1, dr.select(flat, 2, dr.select(still, 3, 0))))
+        ended = dr.select(
+            cost <= _TINY, 4, dr.select(largest <= gtol, 1, dr.select(flat, 2, dr.select(still, 3, 0)))
+        )
         running = status == 0
         take = running & better
         bend = 2 * gain - 1
@@ -264,7 +283,9 @@ class _Solver:
             dr.select(take, new_cost, cost),
             [dr.select(take, a, b) for a, b in zip(new_gradient, gradient, strict=True)],
             [dr.select(take, a, b) for a, b in zip(new_hessian, hessian, strict=True)],
-            dr.clip(damping * dr.select(better, dr.maximum(1 / 3, 1 - bend * bend * bend), growth), 1e-7, 1e10),
+            dr.clip(
+                damping * dr.select(better, dr.maximum(1 / 3, 1 - bend * bend * bend), growth), 1e-7, 1e10
+            ),
             dr.select(better, 2, dr.minimum(2 * growth, 64)),
             dr.select(running, ended, status),
             count + dr.select(running, self.module.UInt32(1), 0),
@@ -306,6 +327,18 @@ def _damped_solution(dr, at, scale, dead, cosine, damping):
             value = dr.fma(-factor[k, i], y[k], value)
         y[i] = value * inverse[i]
     return [dr.select(dead[i], 0, y[i] * scale[i]) for i in range(n)]
+
+
+def _towards(dr, p, step, low, high):
+    """``p + step``, at most 90 % of the way to a bound, or on it from nearby.
+
+    A step that overshoots and lands on a bound at once may switch a part of the model off for good: a lobe of height
+    zero has no gradient in its other parameters.
+    """
+    near = _NEAR_BOUND * (high - low)
+    floor = dr.select(p - low <= near, low, dr.fma(0.9, low - p, p))
+    ceiling = dr.select(high - p <= near, high, dr.fma(0.9, high - p, p))
+    return dr.clip(p + step, floor, ceiling)
 
 
 def _gathered(dr, tree, index):

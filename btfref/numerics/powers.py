@@ -42,15 +42,15 @@ def safe_power(base, exponent):
     return _from_log(np.log2(np.where(counts, base, 1)), exponent, counts, kind)
 
 
-def lobe_power(t, l, n):
+def lobe_power(t, light, n):
     """``(t · l)^n`` of a lobe as the paper stores it, ``t`` of any length; eq. 1.
 
     The axis is scaled by its largest component first, so that neither the product nor the power can overflow.
 
     Parameters
     ----------
-    t, l : array_like, shape (..., 3)
-        Any finite vectors; ``l`` a unit vector.
+    t, light : array_like, shape (..., 3)
+        Any finite vectors; ``light`` a unit vector.
     n : array_like, shape (...)
 
     Returns
@@ -58,20 +58,20 @@ def lobe_power(t, l, n):
     ndarray, shape (...)
         In [0, 2^15], in the type of the arguments.
     """
-    t, l, n = np.asarray(t), np.asarray(l), np.asarray(n)
-    kind = np.result_type(t, l, n)
+    t, light, n = np.asarray(t), np.asarray(light), np.asarray(n)
+    kind = np.result_type(t, light, n)
     scale = np.abs(t).max(-1)
     counts = scale >= kind.type(FLOOR)
     scale = np.where(counts, scale, kind.type(1))
     axis = np.where(counts[..., None], t, 0) / scale[..., None]
-    cosine = (axis * l).sum(-1, dtype=kind)
+    cosine = (axis * light).sum(-1, dtype=kind)
     # The logarithm of the product is the sum of two, each of which is finite.
     counts &= cosine >= kind.type(FLOOR)
     log = np.log2(scale) + np.log2(np.where(counts, cosine, kind.type(1)))
     return _from_log(log, n, counts, kind)
 
 
-def unit_lobe(axis, l, n):
+def unit_lobe(axis, light, n):
     """``(axis · l)^n`` of unit vectors, from the square of their distance.
 
     Near the axis ``axis · l = 1 − |axis − l|² / 2`` keeps the digits that the product loses and a large exponent
@@ -79,7 +79,7 @@ def unit_lobe(axis, l, n):
 
     Parameters
     ----------
-    axis, l : array_like, shape (..., 3)
+    axis, light : array_like, shape (..., 3)
         Unit vectors.
     n : array_like, shape (...)
 
@@ -88,7 +88,7 @@ def unit_lobe(axis, l, n):
     ndarray of float64, shape (...)
         In [0, 1]; 0 where the cosine is not positive.
     """
-    d = np.asarray(axis, float) - np.asarray(l, float)
+    d = np.asarray(axis, float) - np.asarray(light, float)
     h = 0.5 * np.einsum("...i,...i->...", d, d)
     counts = 1 - h >= FLOOR
     log = np.log1p(-np.where(counts, h, 0)) / np.log(2)

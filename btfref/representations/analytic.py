@@ -26,7 +26,7 @@ GUIDE_MEMBERS = 16
 
 @dataclass(frozen=True)
 class Lookups:
-    """N lookups: neighbours (indices and weights, (N, T) and (N, V)) and directions held at the measured edge (N, 3)."""
+    """N lookups: neighbours (indices and weights, (N, T), (N, V)) and directions held at the measured edge (N, 3)."""
 
     texel: np.ndarray
     texel_weight: np.ndarray
@@ -55,7 +55,9 @@ def evaluate_analytic(representation, kernel, uv, w_light, w_view):
     views = interpolation.from_arrays(representation.arrays(), "view")
     uv, w_light, w_view = (np.asarray(a, float) for a in (uv, w_light, w_view))
     shape = np.broadcast_shapes(uv.shape[:-1], w_light.shape[:-1], w_view.shape[:-1])
-    uv, w_light, w_view = (np.broadcast_to(a, (*shape, a.shape[-1])).reshape(-1, a.shape[-1]) for a in (uv, w_light, w_view))
+    uv, w_light, w_view = (
+        np.broadcast_to(a, (*shape, a.shape[-1])).reshape(-1, a.shape[-1]) for a in (uv, w_light, w_view)
+    )
     result = np.zeros((len(uv), 3))
     for start in range(0, len(uv), CHUNK):
         part = slice(start, start + CHUNK)
@@ -128,7 +130,9 @@ def luminance_blocks(btf, progress=None, label="fit"):
     n_views, n_lights, rows, columns, _ = btf.values.shape
     step = max(1, BLOCK // columns)
     for first in range(0, rows, step):
-        block = np.asarray(btf.values[:, :, first : first + step], np.float32).reshape(n_views, n_lights, -1, 3)
+        block = np.asarray(btf.values[:, :, first : first + step], np.float32).reshape(
+            n_views, n_lights, -1, 3
+        )
         if not np.isfinite(block).all():
             raise InputError("the BTF holds a value that is not finite", file=getattr(btf, "path", None))
         luminance = block @ conventions.LUMINANCE.astype(np.float32)
@@ -181,7 +185,9 @@ def sampling_tables(representation):
     means = []
     for group in range(int(labels.max()) + 1):
         members = np.flatnonzero(labels == group)
-        members = members[np.linspace(0, len(members) - 1, min(len(members), GUIDE_MEMBERS)).round().astype(int)]
+        members = members[
+            np.linspace(0, len(members) - 1, min(len(members), GUIDE_MEMBERS)).round().astype(int)
+        ]
         if len(members):
             means.append(representation.luminance_tables(members, np.arange(n_views)).mean(0))
         else:

@@ -1,9 +1,9 @@
 """Generalized cosine lobes per texel: the baseline "LAF" of reflectance fields.
 
-Sources: E. Lafortune et al., "Non-Linear Approximation of Reflectance Functions", SIGGRAPH 1997, eq. 8; D. McAllister et
-al., "Efficient Rendering of Spatial Bi-directional Reflectance Distribution Functions", Graphics Hardware 2002;
-Meseth, Müller, Klein 2004, Table 1: ``f = ρ_d + Σ_j (C_x l_x v_x + C_y l_y v_y + C_z l_z v_z)^n`` of luminance, times the
-texel's chroma.
+Sources: E. Lafortune et al., "Non-Linear Approximation of Reflectance Functions", SIGGRAPH 1997, eq. 8; D. McAllister
+et al., "Efficient Rendering of Spatial Bi-directional Reflectance Distribution Functions", Graphics Hardware 2002;
+Meseth, Müller, Klein 2004, Table 1: ``f = ρ_d + Σ_j (C_x l_x v_x + C_y l_y v_y + C_z l_z v_z)^n`` of luminance, times
+the texel's chroma.
 
 The model is one of f; the data are ``B = f l_z``, so ``f l_z`` is fitted to them and nothing is divided by the cosine.
 A lobe is stored as coefficients in [−1, 1], exponent and peak, instead of as ``C``, whose power could overflow.
@@ -73,6 +73,7 @@ class Representation:
 
     @classmethod
     def from_arrays(cls, arrays, meta):
+        """The representation of these maps."""
         return cls(arrays, meta)
 
 
@@ -100,8 +101,8 @@ def luminance_tables(maps, texels, views):
     peaks = maps["peaks"].reshape(-1, lobes.shape[1])[texels].astype(np.float32)
     result = maps["colour"].reshape(-1, 4)[texels, 3].astype(np.float32)[:, None, None]
     for j in range(lobes.shape[1]):
-        base = np.maximum(np.einsum("nc,vlc->nvl", lobes[:, j, :3], product, optimize=True), np.float32(FLOOR))
-        result = result + peaks[:, j, None, None] * np.exp2(lobes[:, j, 3, None, None] * np.log2(base))
+        base = np.einsum("nc,vlc->nvl", lobes[:, j, :3], product, optimize=True)
+        result = result + peaks[:, j, None, None] * safe_power(base, lobes[:, j, 3, None, None])
     return result * lights[:, 2]
 
 
@@ -271,7 +272,9 @@ def fit_texels(method, btf, fit_block, parameters, progress, storage, filter_typ
         fits.append(result)
     maps = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
     maps = {name: stored(name, array.reshape(rows, columns, -1), storage) for name, array in maps.items()}
-    everything = BatchFit(*(np.concatenate([getattr(f, name) for f in fits]) for name in BatchFit.__dataclass_fields__))
+    everything = BatchFit(
+        *(np.concatenate([getattr(f, name) for f in fits]) for name in BatchFit.__dataclass_fields__)
+    )
     meta = base_meta(method, btf, parameters, filter_type=filter_type)
     meta["constants"] = analytic.edge_constants(btf) | {"n_lobes": parameters["lobes"]}
     failed = np.flatnonzero(~everything.converged)

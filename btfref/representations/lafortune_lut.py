@@ -1,6 +1,6 @@
 """Lafortune lobes times a view-dependent factor from a table per texel: the baseline "SLAF" of reflectance fields.
 
-Sources: K. Daubert et al., "Efficient Cloth Modeling and Rendering", EGWR 2001, eq. 4: the factor stands for what the texel
+Sources: K. Daubert et al., "Efficient Cloth Modeling and Rendering", EGWR 2001: the factor stands for what the texel
 shows of itself to a view (self-occlusion); Meseth, Müller, Klein 2004, Table 1. Lobes: see
 :mod:`btfref.representations.lafortune`.
 """
@@ -36,7 +36,9 @@ class Representation:
         maps = lafortune.flat_maps(self.maps)
 
         def kernel(s):
-            factor = np.einsum("ntv,nv->nt", maps["factor"][s.texel[:, :, None], s.view[:, None, :]], s.view_weight)
+            factor = np.einsum(
+                "ntv,nv->nt", maps["factor"][s.texel[:, :, None], s.view[:, None, :]], s.view_weight
+            )
             value = factor * lafortune.texel_values(maps, s)
             return np.einsum("nt,ntc,nt->nc", s.texel_weight, maps["colour"][s.texel, :3], value)
 
@@ -61,6 +63,7 @@ class Representation:
 
     @classmethod
     def from_arrays(cls, arrays, meta):
+        """The representation of these maps."""
         return cls(arrays, meta)
 
 
@@ -106,7 +109,9 @@ def fit(btf, *, seed=0, progress=None, lobes=4, rounds=1, storage="half", filter
         return result, {"factor": factor.T}
 
     parameters = {"lobes": n_lobes, "rounds": rounds, "storage": storage, "seed": seed}
-    maps, meta = lafortune.fit_texels("lafortune_lut", btf, fit_block, parameters, progress, storage, filter_type)
+    maps, meta = lafortune.fit_texels(
+        "lafortune_lut", btf, fit_block, parameters, progress, storage, filter_type
+    )
     result = Representation(maps, meta)
     meta["fit"]["epsilon"] = analytic.fit_report(result, btf)
     return result

@@ -1,13 +1,13 @@
 """Reflectance fields as a diffuse term and a few cosine lobes per texel and measured view.
 
 Source: J. Meseth, G. Müller, R. Klein, "Reflectance Field Based Real-Time, High-Quality Rendering of Bidirectional
-Texture Functions", Computers & Graphics 2004, eq. 1 ("RFNL"): ``ρ_d(x) + ρ_{s,v}(x) Σ_j (t_{v,j}(x) · l)^{n_{v,j}(x)}`` of
-luminance, times the texel's chroma.
+Texture Functions", Computers & Graphics 2004, eq. 1 ("RFNL"): ``ρ_d(x) + ρ_{s,v}(x) Σ_j (t_{v,j}(x) · l)^{n_{v,j}(x)}``
+of luminance, times the texel's chroma.
 
-Differs from eq. 1 in two points. The data hold the cosine of the light, so the diffuse term is ``ρ_d l_z``, which is what
-eq. 4 makes of it; the lobes are fitted to the data as they are. And a lobe is stored as unit axis, exponent and peak
-``ρ_s ‖t‖^n`` instead of ``ρ_s`` and ``t``: the same functions, but no stored number can overflow when it is raised to a
-power.
+Differs from eq. 1 in two points. The data hold the cosine of the light, so the diffuse term is ``ρ_d l_z``, which is
+what eq. 4 makes of it; the lobes are fitted to the data as they are. And a lobe is stored as unit axis, exponent and
+peak ``ρ_s ‖t‖^n`` instead of ``ρ_s`` and ``t``: the same functions, but no stored number can overflow when it is raised
+to a power.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from btfref.numerics.levenberg import fit_batch
-from btfref.numerics.powers import FLOOR, unit_lobe
+from btfref.numerics.powers import FLOOR, safe_power, unit_lobe
 from btfref.representations import analytic
-from btfref.representations.lookup import base_meta, direction_arrays, packed_arrays, positive_integer, stored
 from btfref.representations.lobe_start import exponent_limit, lobe_starts
+from btfref.representations.lookup import base_meta, direction_arrays, packed_arrays, positive_integer, stored
 
 #: "paper": two lobes in floats.
 PRESETS = {"paper": {"lobes": 2, "storage": "float"}}
@@ -35,6 +35,9 @@ LEAST_EXPONENT = 1.0
 #: Largest peak of a lobe relative to the brightest sample of its fit. An axis midway between samples, at the largest
 #: exponent, needs 2; axes beyond the samples more.
 PEAK_BOUND = 4.0
+
+#: Share of the fits, those that leave most, that are tried from a second start.
+SECOND_CHANCE = 0.15
 
 #: The diffuse albedo of a texel is this quantile of luminance / l_z over its samples: what is there almost always.
 #: Lobes add to it and cannot take away.
@@ -78,8 +81,8 @@ class Representation:
         colour = self.maps["colour"].reshape(-1, 4).astype(np.float32)[texels]
         result = colour[:, 3, None, None] * lights[:, 2]
         for j in range(s.shape[-1]):
-            cosine = np.maximum(axis[:, :, j] @ lights.T, np.float32(FLOOR))
-            result = result + peak[:, :, j, None] * np.exp2(exponent[:, :, j, None] * np.log2(np.minimum(cosine, 1)))
+            power = safe_power(np.minimum(axis[:, :, j] @ lights.T, 1), exponent[:, :, j, None])
+            result = result + peak[:, :, j, None] * power
         return result
 
     def arrays(self):
@@ -96,6 +99,7 @@ class Representation:
 
     @classmethod
     def from_arrays(cls, arrays, meta):
+        """The representation of these maps."""
         return cls(arrays, meta)
 
 
@@ -153,19 +157,31 @@ def lobe_residual(module, luminance, lights, n_lobes):
             r += value
             slope = 2 * scale * dr.select(there, value * exponent / safe, 0)
             along = cosine + z
-            row += [slope * (x - s * along), slope * (y - t * along), value * exponent * log * 0.6931471805599453, power]
+            row += [
+                slope * (x - s * along),
+                slope * (y - t * along),
+                value * exponent * log * 0.6931471805599453,
+                power,
+            ]
         return r, row
 
     return residual
 
 
 def fit(
-    btf, *, seed=0, progress=None, lobes=2, diffuse_quantile=DIFFUSE_QUANTILE, storage="half", filter_type="bilinear"
+    btf,
+    *,
+    seed=0,
+    progress=None,
+    lobes=2,
+    diffuse_quantile=DIFFUSE_QUANTILE,
+    storage="half",
+    filter_type="bilinear",
 ):
     """Fit lobes to ``btf`` by batched Levenberg–Marquardt.
 
-    Fits that do not converge from the first start are repeated from a second one with twice the iterations; the better
-    result is kept, and those that still have not converged are listed.
+    Fits that do not converge, and those that leave most, are repeated from a second start; the better result is kept.
+    Fits that have converged from neither are listed.
 
     Parameters
     ----------
@@ -219,7 +235,10 @@ def fit(
     meta = base_meta("rf_lobes", btf, parameters, filter_type=filter_type)
     meta["constants"] = analytic.edge_constants(btf) | {"n_lobes": n_lobes}
     result = Representation(maps | direction_arrays(btf.views, btf.lights), meta)
-    meta["fit"] = merged(summaries) | {"not_converged_at": failed[:1000], "epsilon": analytic.fit_report(result, btf)}
+    meta["fit"] = merged(summaries) | {
+        "not_converged_at": failed[:1000],
+        "epsilon": analytic.fit_report(result, btf),
+    }
     return result
 
 
@@ -239,10 +258,21 @@ def diffuse_albedo(luminance, lights, quantile):
     if not high.any():
         return np.zeros(luminance.shape[2])
     ratio = luminance[:, high] / lights[high, 2, None].astype(np.float32)
-    return np.maximum(np.quantile(ratio.reshape(-1, ratio.shape[2]), quantile, axis=0, overwrite_input=True), 0)
+    return np.maximum(
+        np.quantile(ratio.reshape(-1, ratio.shape[2]), quantile, axis=0, overwrite_input=True), 0
+    )
 
 
-def fit_lobes(data, lights, n_lobes, *, iterations=100, restart=True):
+def lobe_bounds(data, lights, n_lobes):
+    """Bounds of the parameters of N fits, two arrays of shape (N, 4 n_lobes)."""
+    peak = PEAK_BOUND * np.maximum(data.max(0), 0)[:, None]
+    ones, limit = np.ones_like(peak), np.log(exponent_limit(lights))
+    lower = [-AXIS_BOUND * ones, -AXIS_BOUND * ones, np.log(LEAST_EXPONENT) * ones, 0 * ones]
+    upper = [AXIS_BOUND * ones, AXIS_BOUND * ones, limit * ones, peak]
+    return tuple(np.tile(np.concatenate(columns, 1), n_lobes) for columns in (lower, upper))
+
+
+def fit_lobes(data, lights, n_lobes, *, iterations=100, high_pass=False, restart=True):
     """Lobes of N reflectance fields.
 
     Parameters
@@ -252,8 +282,10 @@ def fit_lobes(data, lights, n_lobes, *, iterations=100, restart=True):
     lights : DirectionSet
     n_lobes : int
     iterations : int
+    high_pass : bool
+        Whether the first start is the paper's; the second is the other one. See :func:`lobe_starts`.
     restart : bool
-        Whether fits that have not converged try the second start.
+        Whether there is a second start.
 
     Returns
     -------
@@ -263,22 +295,25 @@ def fit_lobes(data, lights, n_lobes, *, iterations=100, restart=True):
     from btfref.numerics.levenberg import backend
 
     module = backend()
-    peak = PEAK_BOUND * np.maximum(data.max(0), 0)[:, None]
-    limit = np.log(exponent_limit(lights))
-    ones = np.ones_like(peak)
-    lower = np.tile(np.concatenate([-AXIS_BOUND * ones, -AXIS_BOUND * ones, np.log(LEAST_EXPONENT) * ones, 0 * ones], 1), n_lobes)
-    upper = np.tile(np.concatenate([AXIS_BOUND * ones, AXIS_BOUND * ones, limit * ones, peak], 1), n_lobes)
+    lower, upper = lobe_bounds(data, lights, n_lobes)
 
-    def run(columns, start, steps):
-        residual = lobe_residual(module, data[:, columns], lights.vectors, n_lobes)
-        return fit_batch(residual, start, lower[columns], upper[columns], len(lights), iterations=steps)
+    def run(columns, steps, high_pass):
+        some = data[:, columns]
+        start = lobe_starts(some, lights.vectors, n_lobes, high_pass=high_pass)
+        residual = lobe_residual(module, some, lights.vectors, n_lobes)
+        bounds = lower[columns], upper[columns]
+        # 1e-6 takes a quarter more iterations and lowers the mean cost by 0.03 %.
+        return fit_batch(residual, start, *bounds, len(lights), iterations=steps, ftol=1e-5)
 
-    result = run(slice(None), lobe_starts(data, lights.vectors, n_lobes), iterations)
-    again = np.flatnonzero(~result.converged) if restart else []
+    result = run(slice(None), iterations, high_pass)
+    if not restart:
+        return result
+    worst = result.cost > np.quantile(result.cost, 1 - SECOND_CHANCE)
+    again = np.flatnonzero(~result.converged | worst)
     if len(again):
-        start = lobe_starts(data[:, again], lights.vectors, n_lobes, high_pass=False)
-        second = run(again, start, 2 * iterations)
-        better = second.converged | (second.cost < result.cost[again])
+        second = run(again, 2 * iterations, not high_pass)
+        lower_cost = second.cost < result.cost[again]
+        better = np.where(second.converged == result.converged[again], lower_cost, second.converged)
         for name in ("parameters", "cost", "status", "iterations"):
             getattr(result, name)[again[better]] = getattr(second, name)[better]
     return result

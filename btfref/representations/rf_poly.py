@@ -1,12 +1,12 @@
 """Reflectance fields as biquadratic polynomials: one per texel and measured view.
 
 Sources: J. Meseth, G. Müller, R. Klein, "Reflectance Field Based Real-Time, High-Quality Rendering of Bidirectional
-Texture Functions", Computers & Graphics 2004, section 4 ("RFP"); T. Malzbender, D. Gelb, H. Wolters, "Polynomial Texture
-Maps", SIGGRAPH 2001, eq. 2: ``a0 l_x² + a1 l_y² + a2 l_x l_y + a3 l_x + a4 l_y + a5`` for luminance, times the texel's
-chroma.
+Texture Functions", Computers & Graphics 2004, section 4 ("RFP"); T. Malzbender, D. Gelb, H. Wolters, "Polynomial
+Texture Maps", SIGGRAPH 2001, eq. 2: ``a0 l_x² + a1 l_y² + a2 l_x l_y + a3 l_x + a4 l_y + a5`` for luminance, times the
+texel's chroma.
 
-Differs from that equation in its basis: ``a5 l_z²`` stands in place of ``a5``. On the sphere ``1 = l_x² + l_y² + l_z²``, so the
-functions are the same, but at grazing light, where they are small, large terms do not have to cancel.
+Differs from that equation in its basis: ``a5 l_z²`` stands in place of ``a5``. On the sphere ``1 = l_x² + l_y² +
+l_z²``, so the functions are the same, but at grazing light, where they are small, large terms do not have to cancel.
 """
 
 from __future__ import annotations
@@ -76,6 +76,7 @@ class Representation:
 
     @classmethod
     def from_arrays(cls, arrays, meta):
+        """The representation of these maps."""
         return cls(arrays, meta)
 
 
@@ -96,7 +97,10 @@ def light_operator(lights):
     u, singular, vt = np.linalg.svd(terms(np.asarray(lights, float)), full_matrices=False)
     kept = singular > CUTOFF * singular[0]
     inverse = np.where(kept, 1 / np.where(kept, singular, 1), 0)
-    return (vt.T * inverse) @ u.T, {"rank": int(kept.sum()), "condition": float(singular[0] / singular[kept][-1])}
+    return (vt.T * inverse) @ u.T, {
+        "rank": int(kept.sum()),
+        "condition": float(singular[0] / singular[kept][-1]),
+    }
 
 
 def fit(btf, *, seed=0, progress=None, storage="half", filter_type="bilinear"):

@@ -22,7 +22,7 @@ vec3 btf_eval(vec2 uv, vec3 w_light, vec3 w_view, float lod) {
         if (texels.weight[x] == 0.0) {
             continue;
         }
-        // Daubert et al. 2001, eq. 4: the factor stands for self-occlusion.
+        // Daubert et al. 2001: the factor stands for self-occlusion.
         float visible = 0.0;
         for (int v = 0; v < 4; ++v) {
             int at = texels.index[x] * FACTOR_STRIDE + (views.index[v] >> 2);

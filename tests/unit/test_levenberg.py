@@ -56,7 +56,9 @@ def test_bounds_hold_and_give_the_constrained_optimum(module, rng):
         peer = least_squares(
             lambda p, i=i: p[0] * np.exp(-p[1] * x) - data[:, i], [0.9, 0.9], bounds=([0, 0.5], [1, 10])
         )
-        assert result.cost[i] <= peer.cost * (1 + tolerance("levenberg.peer.cost")) + tolerance("levenberg.peer.floor")
+        assert result.cost[i] <= peer.cost * (1 + tolerance("levenberg.peer.cost")) + tolerance(
+            "levenberg.peer.floor"
+        )
 
 
 def test_fits_that_do_not_converge_are_reported(module, rng):
@@ -120,7 +122,7 @@ def test_lobes_are_no_worse_than_scipy_s(module):
 
     lights = directions("ubo81")
     data = oracle_values((6, 5), lights, lights)[20].mean(-1).reshape(81, -1).astype(np.float32)
-    result = fit_lobes(data, lights, 2, restart=False)
+    result = fit_lobes(data, lights, 2)
     starts = lobe_starts(data, lights.vectors, 2)
     assert result.converged.all()
 

@@ -1,0 +1,143 @@
+"""Fitting lobes: the batched solver against ``scipy.optimize.least_squares``.
+
+Both from the same starts and within the same bounds; the peer with the same analytic Jacobian, and, as it is mostly
+called, without.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from btfref.bench.timing import machine
+
+LOBES = 2
+
+
+def run(*, quick=False, progress=None, btf=None):
+    """Seconds per fit and mean error of both.
+
+    Parameters
+    ----------
+    quick : bool
+        8 fits of the peer instead of 64.
+    progress : callable, optional
+    btf : SampledBTF, optional
+        Default: a checker of 64² texels and 81² directions.
+
+    Returns
+    -------
+    dict
+        ``raw``: seconds; ``summary``: for each solver the seconds a fit takes, and the mean root-mean-square and mean
+        absolute residual over the same random fits, times π; ``parameters``; ``machine``.
+    """
+    from btfref.bench.data import checker
+    from btfref.representations import rf_lobes
+
+    btf = btf or checker(spp=8, progress=progress)
+    lights = btf.lights.vectors
+    data = residual_fields(btf)
+    start = time.perf_counter()
+    whole = rf_lobes.fit(btf).meta["fit"]
+    raw = {"whole fit": time.perf_counter() - start}
+    start = time.perf_counter()
+    result = rf_lobes.fit_lobes(data, btf.lights, LOBES)
+    raw["batched"] = time.perf_counter() - start
+
+    chosen = np.sort(np.random.default_rng(0).choice(data.shape[1], 8 if quick else 64, replace=False))
+    some = data[:, chosen].astype(float)
+    starts = rf_lobes.lobe_starts(data[:, chosen], lights, LOBES).astype(float)
+    lower, upper = (bound.astype(float) for bound in rf_lobes.lobe_bounds(data[:, chosen], btf.lights, LOBES))
+    found = {"batched": result.parameters[chosen].astype(float)}
+    for name, jacobian in (("scipy, analytic Jacobian", True), ("scipy, its own differences", False)):
+        start = time.perf_counter()
+        fits = [
+            scipy_fit(some[:, i], lights, starts[i], lower[i], upper[i], jacobian) for i in range(len(chosen))
+        ]
+        raw[name] = time.perf_counter() - start
+        found[name] = np.stack(fits)
+    own = raw["batched"] / data.shape[1]
+    summary = {}
+    for name, parameters in found.items():
+        model = np.stack([lobes_and_jacobian(p, lights)[0] for p in parameters], 1)
+        residual = np.pi * (model - some)
+        seconds = own if name == "batched" else raw[name] / len(chosen)
+        summary[name] = {
+            "seconds_per_fit": seconds,
+            "ratio": seconds / own,
+            "mean_rms": float(np.sqrt((residual**2).mean(0)).mean()),
+            "mean_absolute": float(np.abs(residual).mean()),
+        }
+    parameters = {"samples": len(lights), "peer_fits": len(chosen), "lobes": LOBES}
+    return {
+        "suite": "lobes",
+        "parameters": parameters | result.summary,
+        "raw": raw,
+        "summary": summary,
+        "whole": whole,
+        "machine": machine(),
+    }
+
+
+def residual_fields(btf):
+    """Luminance without its diffuse term, shape (n_lights, n_views · n_texels)."""
+    from btfref.representations import rf_lobes
+    from btfref.representations.analytic import luminance_blocks
+
+    lights, data = btf.lights.vectors, []
+    for _, luminance, _ in luminance_blocks(btf):
+        diffuse = rf_lobes.diffuse_albedo(luminance, lights, rf_lobes.DIFFUSE_QUANTILE)
+        luminance -= (diffuse * lights[:, 2, None]).astype(np.float32)
+        data.append(np.moveaxis(luminance, 1, 0).reshape(len(lights), -1))
+    return np.concatenate(data, 1)
+
+
+def lobes_and_jacobian(p, lights):
+    """Values at the lights and derivatives by the parameters (s, t, ln n, peak) of each lobe."""
+    value, columns = np.zeros(len(lights)), []
+    for s, t, log_n, peak in p.reshape(-1, 4):
+        d = 1 + s * s + t * t
+        cosine = lights @ np.array([2 * s, 2 * t, 2 - d]) / d
+        there = cosine > 2.0**-24
+        safe, n = np.where(there, cosine, 1), np.exp(log_n)
+        power = np.where(there, safe**n, 0)
+        slope = 2 / d * peak * n * power / safe
+        along = cosine + lights[:, 2]
+        columns += [slope * (lights[:, 0] - s * along), slope * (lights[:, 1] - t * along)]
+        columns += [peak * power * n * np.log(safe), power]
+        value += peak * power
+    return value, np.stack(columns, 1)
+
+
+def scipy_fit(data, lights, start, lower, upper, jacobian):
+    """Parameters that ``scipy.optimize.least_squares`` finds with its default settings."""
+    from scipy.optimize import least_squares
+
+    # Its method needs a start inside the bounds, and bounds apart.
+    upper = np.maximum(upper, lower + 1e-6)
+    inside = np.clip(start, lower + 1e-9, upper - 1e-9)
+    further = {"jac": lambda p: lobes_and_jacobian(p, lights)[1]} if jacobian else {}
+    bounds = lower, upper
+    return least_squares(
+        lambda p: lobes_and_jacobian(p, lights)[0] - data, inside, bounds=bounds, **further
+    ).x
+
+
+def table(result):
+    """Rows for people: solver, time of a fit, ratio, errors."""
+    header = ("solver", "time of a fit", "ratio", "mean rms × π", "mean |residual| × π")
+    rows = [
+        (
+            name,
+            f"{1e6 * s['seconds_per_fit']:.1f} µs",
+            f"{s['ratio']:.0f}",
+            f"{s['mean_rms']:.5f}",
+            f"{s['mean_absolute']:.5f}",
+        )
+        for name, s in result["summary"].items()
+    ]
+    whole, seconds = result["whole"], result["raw"]["whole fit"]
+    rows.append((f"rf_lobes, {whole['fits']} fits, with all around", f"{seconds:.1f} s", "", "", ""))
+    rows.append(("fits that did not converge", str(whole["not_converged"]), "", "", ""))
+    return header, rows
