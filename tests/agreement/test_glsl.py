@@ -20,7 +20,11 @@ DIRECTIONS = {
 }
 
 #: Quick settings, where the defaults are made for larger data.
-SETTINGS = {"lpca": {"clusters": 5, "components": 3}}
+SETTINGS = {
+    "lpca": {"clusters": 5, "components": 3},
+    "lafortune": {"lobes": 2},
+    "lafortune_lut": {"lobes": 2},
+}
 
 N_POINTS = 20_000
 

@@ -12,6 +12,8 @@ UVS = ((0.1, 0.2), (0.72, 0.35), (0.5, 0.5), (0.3, 0.8), (0.9, 0.93))
 VIEWS = {"normal": (0, 0, 1), "oblique": (0.6, 0.2, 0.7), "grazing": (0.9, -0.3, 0.02)}
 SAMPLES = 1_000_000
 
+CASES = [(key, "ubo81") for key in methods()] + [("lpca", "10x5")]
+
 
 @pytest.fixture(scope="module")
 def paths(tmp_path_factory):
@@ -20,12 +22,14 @@ def paths(tmp_path_factory):
     for kind, views in (("ubo81", "ubo81"), ("10x5", "10x5")):
         btf = oracle_btf((24, 20), views, views)
         for key, row in methods().items():
+            if (key, kind) not in CASES:
+                continue
             result[key, kind] = folder / f"{kind}.{key}.exr"
             save(row.fit(btf), result[key, kind])
     return result
 
 
-@pytest.fixture(params=[(key, "ubo81") for key in methods()] + [("lpca", "10x5")], ids="-".join)
+@pytest.fixture(params=CASES, ids="-".join)
 def path(request, paths):
     return paths[request.param]
 

@@ -65,7 +65,7 @@ def test_lobes_come_back(need, rng):
 def test_order_of_the_methods(need):
     """A bumpy, glossy surface: reflectance fields beat the models of a whole texel, a factor per view helps those."""
     need("llvm")
-    btf = oracle_btf((8, 8))
+    btf = oracle_btf((4, 4))
     error = {key: method(key).fit(btf).meta["fit"]["epsilon"]["average"] for key in METHODS}
     assert error["rf_lobes"] < error["rf_poly"] < error["lafortune"]
     assert error["rf_lobes"] < error["lafortune_lut"] < error["lafortune"]
