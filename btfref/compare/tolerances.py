@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import difflib
 import functools
 import tomllib
 from importlib import resources
@@ -97,7 +98,13 @@ def gate_table(key):
     """
     gates = _shipped()
     if key not in gates:
-        raise InputError("unknown gate", file="tolerances.toml", got=repr(key), expected=", ".join(gates))
+        # Not all of them: the message stays a line.
+        like = difflib.get_close_matches(key, gates, n=5, cutoff=0.4) or [
+            k for k in gates if k.startswith("image.")
+        ]
+        raise InputError(
+            "unknown gate", file="tolerances.toml", got=repr(key), expected=f"such as {', '.join(like)}"
+        )
     return copy.deepcopy(gates[key])
 
 
