@@ -21,7 +21,7 @@ from btfref.bench.timing import machine
 
 MESOSTRUCTURES = ("checker", "rings", "tissue")
 
-#: Method -> samples at which its error is about that of the naive loop with 16 or 64 samples.
+#: Label -> estimator and samples. Errors stand beside the times: equal samples are not equal errors.
 METHODS = {
     "naive 16": ("naive", 16),
     "naive 64": ("naive", 64),

@@ -12,9 +12,11 @@ sorted into its texels. L is the sum of
   *light's* texels. Where a light's direction is also a view's these are the same walks, used both ways.
 
 Walks go on to the full depth. What is approximated: the division by Σ w instead of its expectation. Its bias
-of order 1/n with n points in a texel is corrected to first order; what is left, and texels that see fewer
-than `MINIMUM` points and are given view rays instead, biases image means by 0.1 to 0.2 % at 16 points a texel
-on the shipped tissue in direct light, and by nothing that was measurable on the checker.
+of order 1/n with n points in a texel is corrected to first order; texels that see fewer than `MINIMUM` points
+are given view rays instead, which depends on the points and leaves a bias as well. Against the path estimator,
+64² texels, 16 points a texel, direct light: the shipped tissue is 0.1 % too bright on the whole and up to
+0.7 % in single images at 60 degrees and below; on the checker (32 points, depth 8) nothing was measurable.
+There too the variance is too small, by 1.5 on the tissue in direct light; on the checker it was right to 1 %.
 """
 
 from __future__ import annotations
@@ -100,7 +102,7 @@ class SurfaceEstimator:
         self.view_direction = dict(zip(self.wanted.tolist(), index[: len(self.wanted)].tolist(), strict=True))
         self.light_direction = index[len(self.wanted) :]
         self.n_vertices = max_depth - 1 if max_depth > 0 else 2**31
-        # Walks per point and per texel, from what they leave of the noise on the shipped tiles.
+        # Walks per point and per texel; chosen by eye, not tuned.
         self.broad_walks = max(1, round(spp / 6))
         self.rest_walks = max(1, round(spp / 32))
         if not len(self.directions) or not len(self.lit):
