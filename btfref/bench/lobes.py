@@ -14,8 +14,14 @@ from btfref.bench.timing import machine
 
 LOBES = 2
 
+#: Ways to call SciPy's optimizer: name in tables, and whether it gets the Jacobian.
+PEERS = {
+    "jacobian": ("scipy, analytic Jacobian", True),
+    "differences": ("scipy, its own differences", False),
+}
 
-def run(*, quick=False, progress=None, btf=None):
+
+def run(*, quick=False, progress=None, btf=None, only=None):
     """Seconds per fit and mean error of both.
 
     Parameters
@@ -25,6 +31,8 @@ def run(*, quick=False, progress=None, btf=None):
     progress : callable, optional
     btf : SampledBTF, optional
         Default: a checker of 64² texels and 81² directions.
+    only : sequence of str, optional
+        Some of the peers "jacobian", "differences"; the batched solver always runs.
 
     Returns
     -------
@@ -50,7 +58,9 @@ def run(*, quick=False, progress=None, btf=None):
     starts = rf_lobes.lobe_starts(data[:, chosen], lights, LOBES).astype(float)
     lower, upper = (bound.astype(float) for bound in rf_lobes.lobe_bounds(data[:, chosen], btf.lights, LOBES))
     found = {"batched": result.parameters[chosen].astype(float)}
-    for name, jacobian in (("scipy, analytic Jacobian", True), ("scipy, its own differences", False)):
+    for short, (name, jacobian) in PEERS.items():
+        if only is not None and short not in only:
+            continue
         start = time.perf_counter()
         fits = [
             scipy_fit(some[:, i], lights, starts[i], lower[i], upper[i], jacobian) for i in range(len(chosen))
