@@ -3,10 +3,10 @@
 ε is the mean of |B − model| in luminance over all measured pairs of directions (their eq. 2), times π: a white diffuser
 under perpendicular light has 1, as in their data.
 
-Memory: they report about 365 MB for 256² texels and 81 views in floats, which is 17.2 floats a texel and view. Two lobes
-of their eq. 1 need 9 (191 MB), four need 17 (361 MB): the figure fits four. Ours takes 4 a lobe, the peak in place of
-ρ_s and ‖t‖: 170.9 MB for two lobes with chroma and ρ_d, half of that in halves. Eight bits hold for the polynomials only;
-peaks and exponents of lobes need the range of a half.
+Memory: they report about 365 MB for 256² texels and 81 views in floats, which is 17.2 floats a texel and view. Two
+lobes of their eq. 1 need 9 (191 MB), four need 17 (361 MB): the figure fits four. Ours takes 4 a lobe, the peak in
+place of ρ_s and ‖t‖: 170.9 MB for two lobes with chroma and ρ_d, half of that in halves. Eight bits hold for the
+polynomials; peaks and exponents of lobes need the range of a half.
 """
 
 from __future__ import annotations
