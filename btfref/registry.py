@@ -57,14 +57,15 @@ class Method:
         return import_module(self.module).PRESETS
 
 
-def _row(key, title, paper):
+def _row(key, title, paper, *, ports=None):
+    """A row of btfref's own; ``ports`` names the method whose ports evaluate the same maps."""
     return Method(
         key,
         title,
         paper,
         module=f"btfref.representations.{key}",
-        plugin=f"mitsuba_plugins.{key}",
-        shader=f"representations/{key}.glsl",
+        plugin=f"mitsuba_plugins.{ports or key}",
+        shader=f"representations/{ports or key}.glsl",
     )
 
 
@@ -76,6 +77,8 @@ _ROWS = (
     _row("rf_lobes", "Reflectance fields: cosine lobes per view", "Meseth, Müller, Klein 2004"),
     _row("lafortune", "Generalized cosine lobes per texel", "Lafortune et al. 1997, McAllister et al. 2002"),
     _row("lafortune_lut", "Lafortune lobes times a table over views", "Daubert et al. 2001"),
+    _row("cmf", "Chained matrix factorization, clustered", "Suykens, vom Berge, Lagae, Dutré 2003"),
+    _row("hf", "Homomorphic factorization, clustered", "McCool, Ang, Ahmad 2001", ports="cmf"),
 )
 
 

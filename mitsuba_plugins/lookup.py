@@ -233,8 +233,10 @@ def direction_table(arrays, prefix):
 
 
 def tensor(array):
-    """A Dr.Jit tensor of the array's own type (float16, float32 or uint32)."""
+    """A Dr.Jit tensor of the array's own type (float16, float32 or uint32); uint8 in words of four codes."""
     array = np.ascontiguousarray(array)
+    if array.dtype == np.uint8:
+        array = array.view("<u4").astype(np.uint32)
     kind = {"float16": mi.TensorXf16, "float32": mi.TensorXf, "uint32": mi.TensorXu}[array.dtype.name]
     return kind(array)
 

@@ -17,7 +17,8 @@ from btfref.render import composer
 #: Texels of a row of a table's texture; shaders/lib/table.glsl takes the index apart with the same number.
 TABLE_WIDTH = 4096
 
-_DTYPES = {"float16": "f2", "float32": "f4", "uint32": "u4"}
+#: moderngl's name of each type's texture; 8-bit codes are read as code / 255.
+_DTYPES = {"float16": "f2", "float32": "f4", "uint32": "u4", "uint8": "f1"}
 
 
 @cache
@@ -58,7 +59,7 @@ def upload(ctx, array, name):
     Parameters
     ----------
     ctx : moderngl.Context
-    array : ndarray of float16, float32 or uint32, shape (..., k)
+    array : ndarray of float16, float32, uint32 or uint8 (normalized), shape (..., k)
         k is a multiple of 4.
     name : str
         For error messages.

@@ -2,7 +2,8 @@
 
 A part's channels are the last axis of its map; the other axes fold into the image: trailing axes into columns
 while they fit 8192, the rest into rows. The manifest (JSON, attribute ``btfref`` of the first part) keeps shapes
-and types, so that the maps come back exactly.
+and types, so that the maps come back exactly. OpenEXR has no 8-bit channels: uint8 maps, whose value is code / 255,
+stand in the file as half floats of that value, which viewers show and which round back to their code.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from btfref.registry import method
 ATTRIBUTE = "btfref"
 MAXIMUM_WIDTH = 8192
 _MAGIC = bytes((0x76, 0x2F, 0x31, 0x01))
-_TYPES = ("float16", "float32", "uint32")
+_TYPES = ("float16", "float32", "uint32", "uint8")
 
 
 def save(representation, path):
@@ -62,6 +63,8 @@ def save(representation, path):
     for name, image in images.items():
         if image.dtype.name not in _TYPES:
             raise TypeError(f"map {name} must be one of {_TYPES}, got {image.dtype}")
+        if image.dtype == np.uint8:
+            image = (image / 255).astype(np.float16)
         header = {
             "name": name,
             "type": OpenEXR.scanlineimage,
@@ -229,7 +232,8 @@ def _open(path, *, header_only):
 
 def _read_map(path, name, entry, part):
     shape = tuple(entry["shape"])
-    result = np.zeros((*_image_size(shape), shape[-1]), entry["dtype"])
+    byte = entry["dtype"] == "uint8"
+    result = np.zeros((*_image_size(shape), shape[-1]), "float16" if byte else entry["dtype"])
     for i, channel in enumerate(_channel_names(shape[-1])):
         pixels = part.channels[channel].pixels if channel in part.channels else None
         if pixels is None or pixels.shape != result.shape[:2] or pixels.dtype != result.dtype:
@@ -244,4 +248,8 @@ def _read_map(path, name, entry, part):
         result[..., i] = pixels
     if result.dtype.kind == "f" and not np.isfinite(result).all():
         raise InputError("a map holds a value that is not finite", file=path, field=name)
+    if byte:
+        if ((result < 0) | (result > 1)).any():
+            raise InputError("an 8-bit map holds a value out of range", file=path, field=name, expected="[0, 1]")
+        result = np.rint(result.astype(np.float32) * 255).astype(np.uint8)
     return result.reshape(shape)

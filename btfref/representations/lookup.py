@@ -48,6 +48,29 @@ def evaluate_tabulated(representation, kernel, uv, w_light, w_view):
     """
     arrays, meta = representation.arrays(), representation.meta
     views, lights = interpolation.from_arrays(arrays, "view"), interpolation.from_arrays(arrays, "light")
+
+    def lookup(uv, w_light, w_view):
+        texel, texel_weight = conventions.texel_stencil(uv, meta["texels"], meta["filter_type"])
+        view, view_weight = views.stencil(w_view)
+        light, light_weight = lights.stencil(w_light, hold=False)
+        return kernel(Stencils(texel, texel_weight, view, view_weight, light, light_weight))
+
+    return evaluate_points(lookup, uv, w_light, w_view)
+
+
+def evaluate_points(lookup, uv, w_light, w_view):
+    """Evaluate point by point: broadcast, leave out what is not valid, bound the memory.
+
+    Parameters
+    ----------
+    lookup : callable
+        ``uv (N, 2), w_light (N, 3), w_view (N, 3) -> (N, 3)`` float64, for valid directions.
+    uv, w_light, w_view : array_like, shape (..., 2), (..., 3), (..., 3)
+
+    Returns
+    -------
+    ndarray of float64, shape (..., 3)
+    """
     uv, w_light, w_view = (np.asarray(a, float) for a in (uv, w_light, w_view))
     shape = np.broadcast_shapes(uv.shape[:-1], w_light.shape[:-1], w_view.shape[:-1])
     uv, w_light, w_view = (
@@ -59,11 +82,7 @@ def evaluate_tabulated(representation, kernel, uv, w_light, w_view):
         valid = conventions.valid_directions(w_light[part]) & conventions.valid_directions(w_view[part])
         if not valid.any():
             continue
-        texel, texel_weight = conventions.texel_stencil(uv[part][valid], meta["texels"], meta["filter_type"])
-        view, view_weight = views.stencil(w_view[part][valid])
-        light, light_weight = lights.stencil(w_light[part][valid], hold=False)
-        stencils = Stencils(texel, texel_weight, view, view_weight, light, light_weight)
-        result[part][valid] = kernel(stencils)
+        result[part][valid] = lookup(uv[part][valid], w_light[part][valid], w_view[part][valid])
     return result.reshape(*shape, 3)
 
 

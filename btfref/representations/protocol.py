@@ -40,7 +40,10 @@ class Representation(Protocol):
         """
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All maps, float16, float32 or uint32, last axis = channels; names are the parts of the file."""
+        """All maps, float16, float32, uint32 or uint8 (value code / 255), last axis = channels.
+
+        Their names are the parts of the file.
+        """
 
     def port_arrays(self) -> dict[str, np.ndarray]:
         """The maps as the ports read them: last axis a multiple of 4, what one lookup needs contiguous."""

@@ -1,0 +1,62 @@
+"""Half and difference vectors of a pair of directions (Rusinkiewicz 1998; Kautz and McCool 1999).
+
+The difference vector is the light direction in a frame about the half vector. Kautz and McCool orthonormalise the
+surface's tangent against h (GSHD), which is singular where h meets the tangent. Differs from theirs: the frame is the
+surface's own, turned on the shortest way from the normal to h. It equals theirs to first order about the normal and is
+smooth on the whole hemisphere, so that float32 and float64 agree.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def half_frame(h):
+    """Tangent and bitangent at the half vector, shape (..., 3) -> two of (..., 3).
+
+    Parameters
+    ----------
+    h : array_like
+        Unit vectors with z ≥ 0.
+    """
+    x, y, z = np.moveaxis(np.asarray(h, float), -1, 0)
+    a = 1 / (1 + z)
+    tangent = np.stack([1 - x * x * a, -x * y * a, -x], -1)
+    bitangent = np.stack([-x * y * a, 1 - y * y * a, -y], -1)
+    return tangent, bitangent
+
+
+def half_difference(w_light, w_view):
+    """Half and difference vectors.
+
+    Parameters
+    ----------
+    w_light, w_view : array_like, shape (..., 3)
+        Unit vectors of the upper hemisphere.
+
+    Returns
+    -------
+    h, d : ndarray, shape (..., 3)
+        Unit vectors with z ≥ 0: h in the surface's frame, d (the light) in that of h.
+    """
+    w_light, w_view = np.broadcast_arrays(np.asarray(w_light, float), np.asarray(w_view, float))
+    h = w_light + w_view
+    length = np.linalg.norm(h, axis=-1, keepdims=True)
+    # Opposite directions on the horizon have no half vector; any will do there, where B is zero.
+    h = np.where(length > 0, h / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
+    tangent, bitangent = half_frame(h)
+    d = np.stack([(w_light * axis).sum(-1) for axis in (tangent, bitangent, h)], -1)
+    return h, d
+
+
+def in_out(h, d):
+    """Inverse of :func:`half_difference`: light and view directions, which may lie below the horizon.
+
+    Parameters
+    ----------
+    h, d : array_like, shape (..., 3)
+    """
+    h, d = np.broadcast_arrays(np.asarray(h, float), np.asarray(d, float))
+    tangent, bitangent = half_frame(h)
+    w_light = d[..., :1] * tangent + d[..., 1:2] * bitangent + d[..., 2:] * h
+    return w_light, 2 * (w_light * h).sum(-1, keepdims=True) * h - w_light

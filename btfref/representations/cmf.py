@@ -1,0 +1,289 @@
+"""Chained matrix factorization: each texel's table as a product of maps of single directions.
+
+Source: F. Suykens, K. vom Berge, A. Lagae, P. Dutré, "Interactive Rendering with Bidirectional Texture Functions",
+Eurographics 2003, sections 4 and 5. Half-vector factor first: the mean over difference directions (three factors), or
+the leading terms of the half/difference matrix (four factors). Then the data divided by it, element by element, in the
+measured parameterization; the leading terms of that residue are the factors of light and view.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from btfref.errors import InputError
+from btfref.numerics.directions import DirectionSet, ring_directions
+from btfref.numerics.factoring import TINY, FactorOperators, rank_terms, refine, sparse_operator
+from btfref.numerics.halfway import half_difference, in_out
+from btfref.numerics.parabolic import texel_directions
+from btfref.representations.factored import Representation, light_fade, texel_parts
+from btfref.representations.factored_fit import assemble, check_parameters, map_operators, unit_tables
+from btfref.representations.lookup import positive_integer
+
+__all__ = ["PRESETS", "Representation", "fit"]
+
+#: "paper": factors as the chain leaves them, 8 bits, scales from the normalisation alone.
+PRESETS = {"paper": {"sweeps": 0, "rescale": False, "storage": "byte"}}
+
+#: Step of the difference directions in degrees: the paper's 8 polar angles.
+DIFFERENCE_STEP = 11.25
+
+#: Texels on which the resampling errors are measured.
+N_PROBED = 48
+
+
+def ring_set(step):
+    """Rings from the pole to the horizon, about ``step`` degrees apart and equally dense along each."""
+    n = max(1, int(np.ceil(90 / step - 1e-9)))
+    polar = np.arange(1, n + 1) * (90 / n)
+    counts = np.maximum(6, np.round(np.sin(np.radians(polar)) * 360 / step)).astype(int)
+    return DirectionSet(
+        ring_directions([(0, 1, 0), *((float(p), int(c), 0) for p, c in zip(polar, counts, strict=True))]), "rings"
+    )
+
+
+class Resampling:
+    """Linear operators between the parameterizations, the same for all texels and channels.
+
+    Parameters
+    ----------
+    views, lights : DirectionSet
+    half_step : float
+        Degrees between samples of the half vector.
+    map_size : int
+    four : bool
+        With the difference factor.
+    """
+
+    def __init__(self, views, lights, half_step, map_size, four):
+        self.half_set = ring_set(half_step)
+        self.difference_set = ring_set(DIFFERENCE_STEP)
+        h, d = half_difference(lights.vectors[None], views.vectors[:, None])
+        self.half_stencil = self.half_set.stencil(h.reshape(-1, 3))
+        self.difference_stencil = self.difference_set.stencil(d.reshape(-1, 3))
+        self.measured = FactorOperators(
+            p=sparse_operator(np.arange(len(lights))[:, None], np.ones((len(lights), 1)), len(lights)),
+            q=sparse_operator(*self.half_stencil, len(self.half_set)),
+            r=sparse_operator(np.arange(len(views))[:, None], np.ones((len(views), 1)), len(views)),
+            d=sparse_operator(*self.difference_stencil, len(self.difference_set)) if four else None,
+        )
+        self.to_half_difference, self.known = self._half_difference(views, lights)
+        # Pairs that no one measured carry no weight in the mean over difference directions.
+        share = self.known / np.maximum(self.known.sum(1, keepdims=True), 1)
+        rows = np.repeat(np.arange(len(self.half_set)), len(self.difference_set))
+        mean = sparse_operator(np.arange(share.size)[:, None], share.reshape(-1, 1), share.size)
+        gather = sparse_operator(rows[:, None], np.ones((len(rows), 1)), len(self.half_set)).T
+        self.to_half = (gather @ mean @ self.to_half_difference).tocsr()
+        self.to_maps = self._parabolic(views, lights, map_size, four)
+        maps = map_operators(views.vectors, lights.vectors, map_size, four)
+        self.through_maps = FactorOperators(
+            **{name: (getattr(maps, name) @ to).tocsr() for name, to in self.to_maps.items()}
+        )
+
+    def _half_difference(self, views, lights):
+        """Operator (view, light) -> (half, difference), and where both directions are above the horizon."""
+        w_light, w_view = in_out(self.half_set.vectors[:, None], self.difference_set.vectors[None])
+        known = (w_light[..., 2] >= -1e-9) & (w_view[..., 2] >= -1e-9)
+        up = np.array([0.0, 0.0, 1.0])
+        light, light_weight = lights.stencil(np.where(known[..., None], w_light, up))
+        view, view_weight = views.stencil(np.where(known[..., None], w_view, up))
+        index = view[..., :, None] * len(lights) + light[..., None, :]
+        weight = view_weight[..., :, None] * light_weight[..., None, :] * known[..., None, None]
+        operator = sparse_operator(
+            index.reshape(known.size, -1), weight.reshape(known.size, -1), len(views) * len(lights)
+        )
+        return operator, known.astype(np.float32)
+
+    def _parabolic(self, views, lights, map_size, four):
+        """Operators from the factors' samples to the texels of their maps."""
+        w = texel_directions(map_size).reshape(-1, 3)
+        above = w + [0, 0, 1e-3]
+        above /= np.linalg.norm(above, axis=1, keepdims=True)
+        index, weight = lights.stencil(above, hold=False)
+        # The part of the fall to the horizon that every evaluation applies is taken out of the map.
+        weight = weight / light_fade(above, float(lights.vectors[:, 2].min()))[:, None]
+        result = {
+            "p": sparse_operator(index, weight, len(lights)),
+            "q": sparse_operator(*self.half_set.stencil(w), len(self.half_set)),
+            "r": sparse_operator(*views.stencil(w), len(views)),
+        }
+        if four:
+            result["d"] = sparse_operator(*self.difference_set.stencil(w), len(self.difference_set))
+        return result
+
+    def errors(self, data, factors):
+        """Relative RMS errors of going to another parameterization and back, for tables and their factors."""
+        there = (self.to_half_difference @ data.reshape(-1, data.shape[-1])).reshape(*self.known.shape, -1)
+        (h, h_weight), (d, d_weight) = self.half_stencil, self.difference_stencil
+        back = np.zeros_like(data.reshape(-1, data.shape[-1]))
+        for i in range(h.shape[1]):
+            for j in range(d.shape[1]):
+                back += (h_weight[:, i] * d_weight[:, j]).astype(np.float32)[:, None] * there[h[:, i], d[:, j]]
+
+        def relative(test, reference):
+            energy = float((reference.astype(float) ** 2).sum())
+            return float(np.sqrt(((test - reference).astype(float) ** 2).sum() / energy)) if energy > 0 else 0.0
+
+        result = {"half_difference": relative(back, data.reshape(back.shape))}
+        for name, factor in factors.items():
+            result[f"parabolic_{name}"] = relative(
+                self.through_maps.read(name, factor), self.measured.read(name, factor)
+            )
+        return result
+
+
+def chain(data, resampling, terms, floor):
+    """The chained factorization of tables.
+
+    Parameters
+    ----------
+    data : ndarray of float32, shape (view, light, m)
+        Non-negative.
+    resampling : Resampling
+    terms : int
+        Terms of each matrix decomposition.
+    floor : float
+        The half-vector approximation, by which the data are divided, counts as at least this share of its mean.
+
+    Returns
+    -------
+    dict of str to ndarray, shape (term, sample, m)
+    """
+    flat = data.reshape(-1, data.shape[-1])
+    if resampling.measured.d is None:
+        factors = {"q": (resampling.to_half @ flat)[None]}
+    else:
+        matrix = (resampling.to_half_difference @ flat).reshape(*resampling.known.shape, -1)
+        q, d = rank_terms(matrix, resampling.known, terms)
+        factors = {"q": q, "d": d}
+    half = resampling.measured.half(factors)
+    residue = data / np.maximum(half, np.maximum(floor * half.mean((0, 1)), TINY))
+    factors["r"], factors["p"] = rank_terms(residue, None, terms)
+    return factors
+
+
+def fit(
+    btf,
+    *,
+    seed=0,
+    progress=None,
+    difference=False,
+    terms=1,
+    sweeps=6,
+    floor=1e-3,
+    half_step=5.0,
+    map_size=32,
+    clusters=256,
+    storage="half",
+    rescale=True,
+    filter_type="bilinear",
+):
+    """Chained matrix factorization of ``btf``, clustered.
+
+    Parameters
+    ----------
+    btf : SampledBTF
+        Negative values count as 0.
+    seed : int
+        Of the clustering.
+    progress : callable, optional
+        ``progress(done, total, label)``.
+    difference : bool
+        Four factors: with one of the difference vector.
+    terms : int
+        Non-negative terms of each matrix decomposition, at least 1.
+    sweeps : int
+        Multiplicative updates of all factors after the chain, towards the least squared error of the product as the
+        maps give it. Differs from the paper, which stops after the chain (0): the residue's decomposition weighs
+        every sample of the quotient alike, however small the product is there.
+    floor : float
+        Share of its mean below which the half-vector approximation is held when the data are divided by it.
+    half_step : float
+        Degrees between samples of the half vector.
+    map_size : int
+        Texels along a side of a parabolic map, at least 2.
+    clusters : int or None
+        Largest codebook of each factor; None: no clustering.
+    storage : {"half", "float", "byte"}
+    rescale : bool
+        Fit the scales to the data again with the stored maps.
+    filter_type : {"bilinear", "nearest"}
+
+    Returns
+    -------
+    Representation
+        ``meta["fit"]``: relative squared errors of the factors ("factors"), of the maps before clustering ("maps"),
+        and of what is stored ("error"); "resampling": relative RMS errors of the changes of parameterization.
+
+    Raises
+    ------
+    InputError
+        For parameters out of range, or a value that is not finite.
+    """
+    check_parameters(clusters=clusters, storage=storage)
+    terms, map_size = positive_integer("terms", terms), positive_integer("map_size", map_size)
+    if map_size < 2:
+        raise InputError("a parameter is out of range", field="map_size", got=map_size, expected="at least 2")
+    for name, value, low, high in (("floor", floor, 0, 1), ("half_step", half_step, 0.5, 90), ("sweeps", sweeps, 0, 1000)):
+        if not low <= value <= high:
+            raise InputError("a parameter is out of range", field=name, got=value, expected=f"{low} to {high}")
+    rows, columns = btf.values.shape[2:4]
+    n_texels = rows * columns
+    parts = texel_parts(n_texels)
+    # Then come the codebooks and the scales.
+    steps = len(parts) + 4 + difference
+    report = progress or (lambda *_: None)
+    resampling = Resampling(btf.views, btf.lights, half_step, map_size, difference)
+    names = tuple(resampling.to_maps)
+    # The mean over difference directions is one term, whatever the number of P and R.
+    counts = {name: terms if difference or name != "q" else 1 for name in names}
+    maps = {name: np.zeros((n_texels, counts[name], map_size, map_size, 3), np.float32) for name in names}
+    energy, squared = 0.0, dict.fromkeys(("factors", "maps"), 0.0)
+    probes = []
+    for step, texels in enumerate(parts):
+        report(step + 1, steps, "factorization")
+        data, mean = unit_tables(btf, texels)
+        factors = chain(data, resampling, terms, floor)
+        energy += float(((data * mean).astype(float) ** 2).sum())
+        squared["factors"] += _squared_error(data, resampling.measured.product(factors), mean)
+        if step % max(1, len(parts) // 4) == 0 and len(probes) * len(texels) < N_PROBED:
+            probes.append(resampling.errors(data, factors))
+        factors = refine(data, factors, resampling.through_maps, sweeps)
+        squared["maps"] += _squared_error(data, resampling.through_maps.product(factors), mean)
+        factors["p"] = factors["p"] * mean
+        for name in names:
+            values = np.stack([resampling.to_maps[name] @ term for term in factors[name]])
+            values = values.reshape(counts[name], map_size, map_size, len(texels), 3)
+            maps[name][texels] = np.moveaxis(values, 3, 0)
+    parameters = {
+        "difference": difference,
+        "terms": terms,
+        "sweeps": sweeps,
+        "floor": floor,
+        "half_step": half_step,
+        "map_size": map_size,
+        "clusters": clusters,
+        "storage": storage,
+        "rescale": rescale,
+        "seed": seed,
+    }
+    labels = iter(range(len(parts) + 1, steps + 1))
+    result = assemble(
+        "cmf",
+        btf,
+        maps,
+        parameters,
+        clusters=clusters,
+        storage=storage,
+        rescale=rescale,
+        seed=seed,
+        filter_type=filter_type,
+        report=lambda label: report(next(labels), steps, label),
+    )
+    result.meta["fit"] |= {name: value / energy if energy > 0 else 0.0 for name, value in squared.items()}
+    result.meta["fit"]["resampling"] = {name: float(np.mean([p[name] for p in probes])) for name in probes[0]}
+    return result
+
+
+def _squared_error(data, model, mean):
+    return float((((model - data) * mean).astype(float) ** 2).sum())
+

@@ -1,0 +1,201 @@
+"""BTFs as products of parabolic maps of single directions: what ``cmf`` and ``hf`` have in common.
+
+Source: F. Suykens, K. vom Berge, A. Lagae, P. Dutré, "Interactive Rendering with Bidirectional Texture Functions",
+Eurographics 2003, sections 5 and 6: ``B(x, l, v) = S(x) P_{I.r(x)}(l) Q_{I.g(x)}(h) R_{I.b(x)}(v)``; in general
+``Σ_k S_k P_k(l) R_k(v) · Σ_j T_j Q_j(h) D_j(d)``, each P, Q, R, D the map of a codebook that the texel's index names.
+Maps hold [0, 1]. Differs from the paper: B holds the light's cosine, so that a host does not multiply by it; the four
+texels around a lookup are evaluated and blended; the scale is fitted again to the stored maps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from btfref import conventions
+from btfref.numerics.halfway import half_difference
+from btfref.numerics.parabolic import bilinear_stencil
+from btfref.representations.guide import N_GROUPS, feature_views, group_means, texel_groups
+from btfref.representations.lookup import evaluate_points, packed_arrays
+
+#: Factors in the order of the index map's channels; with one term each and no D these are the paper's r, g and b.
+FACTORS = ("p", "q", "r", "d")
+
+#: Members of a group of texels from which its mean for importance sampling is taken.
+GUIDE_MEMBERS = 16
+
+
+@dataclass(frozen=True)
+class Representation:
+    """Codebooks and index maps.
+
+    ``factor_p``, ``factor_q``, ``factor_r`` and, in the four-factor form, ``factor_d`` [prototype, n, n, 3];
+    ``index`` [row, column, channel] uint32: a prototype for each term of P, then of Q, R and D; ``scale_map``
+    [row, column, term, 3] in [0, 1] times ``scale_peak`` [term, 3]; ``half_scale`` [row, column, term, 3] with more
+    than one term of Q · D. uint8 maps hold 255 times their value.
+    """
+
+    maps: dict
+    meta: dict
+
+    def evaluate(self, uv, w_light, w_view, *, lod=0.0):
+        """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored.
+
+        Never negative.
+        """
+        meta = self.meta
+        n = self.maps["factor_p"].shape[1]
+        index = self.maps["index"].reshape(-1, self.maps["index"].shape[-1])
+        scale, half_scale = self._scales()
+        tables = {name: self.maps[f"factor_{name}"].reshape(-1, n * n, 3) for name in self.names}
+        slots = index_slots(meta["constants"])
+
+        def lookup(uv, w_light, w_view):
+            texel, weight = conventions.texel_stencil(uv, meta["texels"], meta["filter_type"])
+            h, d = half_difference(w_light, w_view)
+            stencils = {
+                name: bilinear_stencil(w, n)
+                for name, w in zip(FACTORS, (w_light, h, w_view, d), strict=True)
+                if name in tables
+            }
+
+            def read(name, k):
+                texels, share = stencils[name]
+                prototype = index[texel, slots[name].start + k]
+                values = decoded(tables[name][prototype[:, :, None], texels[:, None, :]])
+                return np.einsum("nxtc,nt->nxc", values, share)
+
+            in_out = sum(
+                scale[texel, k] * read("p", k) * read("r", k) for k in range(meta["constants"]["n_terms"])
+            )
+            half = sum(
+                half_scale[texel, j] * read("q", j) * (read("d", j) if "d" in tables else 1)
+                for j in range(meta["constants"]["n_half_terms"])
+            )
+            fade = light_fade(w_light, meta["constants"]["light_cos_last"])
+            return np.einsum("nxc,nx->nc", in_out * half, weight) * fade[:, None]
+
+        return evaluate_points(lookup, uv, w_light, w_view)
+
+    @property
+    def names(self):
+        """The factors that there are, in order."""
+        return tuple(name for name in FACTORS if f"factor_{name}" in self.maps)
+
+    def _scales(self):
+        """Scales of the terms of P · R and of Q · D, shapes (texel, term, 3), in float64."""
+        scale = decoded(self.maps["scale_map"]) * self.maps["scale_peak"].astype(float)
+        scale = scale.reshape(-1, *scale.shape[2:])
+        if "half_scale" in self.maps:
+            half = decoded(self.maps["half_scale"])
+            return scale, half.reshape(-1, *half.shape[2:])
+        return scale, np.ones((len(scale), 1, 3))
+
+    def factors(self, texels):
+        """Factors of some texels with their scales, as :class:`~btfref.numerics.factoring.FactorOperators` reads them.
+
+        Parameters
+        ----------
+        texels : array_like of int, shape (k,)
+            Flat indices.
+
+        Returns
+        -------
+        dict of str to ndarray of float32, shape (term, n², k * 3)
+        """
+        index = self.maps["index"].reshape(-1, self.maps["index"].shape[-1])[texels]
+        slots = index_slots(self.meta["constants"])
+        scale, half_scale = self._scales()
+        result = {}
+        for name in self.names:
+            table = self.maps[f"factor_{name}"]
+            maps = decoded(table[index[:, slots[name]]], np.float32)  # texel, term, n, n, 3
+            for amount, of in ((scale, "p"), (half_scale, "q")):
+                if name == of:
+                    maps = maps * amount[texels][:, :, None, None].astype(np.float32)
+            result[name] = batch_last(maps)
+        return result
+
+    def tables(self, texels, operators):
+        """B of some texels at all measured pairs, shape (view, light, k, 3) float32."""
+        product = operators.product(self.factors(texels))
+        return product.reshape(*operators.shape, -1, 3)
+
+    def arrays(self):
+        """Codebooks, index and scales, and the direction tables."""
+        return self.maps
+
+    def port_arrays(self):
+        """The same maps with channels padded to four."""
+        return packed_arrays(self.maps)
+
+    def sampling_tables(self):
+        """Groups of texels alike, and the means of some of their members."""
+        from btfref.representations.factored_fit import map_operators
+
+        n_texels = int(np.prod(self.meta["texels"]))
+        views = self.maps["view_directions"].astype(float)
+        lights = self.maps["light_directions"].astype(float)
+        some = map_operators(views[feature_views(len(views))], lights, self.maps["factor_p"].shape[1], "d" in self.names)
+        features = np.concatenate(
+            [
+                np.moveaxis(conventions.luminance(self.tables(part, some)), -1, 0).reshape(len(part), -1)
+                for part in texel_parts(n_texels)
+            ]
+        )
+        labels = texel_groups(features)
+        order = np.argsort(labels, kind="stable")
+        rank = np.arange(n_texels) - np.searchsorted(labels[order], labels[order])
+        count = np.bincount(labels, minlength=N_GROUPS)[labels[order]]
+        # Evenly spread members, so that a large group is not judged by its first rows.
+        spacing = np.maximum(count // GUIDE_MEMBERS, 1)
+        members = order[(rank % spacing == 0) & (rank // spacing < GUIDE_MEMBERS)]
+        operators = map_operators(views, lights, self.maps["factor_p"].shape[1], "d" in self.names)
+        tables = np.concatenate(
+            [
+                np.moveaxis(conventions.luminance(self.tables(part, operators)), -1, 0)
+                for part in texel_parts(len(members), members)
+            ]
+        )
+        return labels.reshape(self.meta["texels"]), group_means(labels[members], tables)
+
+    @classmethod
+    def from_arrays(cls, arrays, meta):
+        return cls(arrays, meta)
+
+
+def index_slots(constants):
+    """Channels of the index map that hold each factor's terms, as slices."""
+    terms, half_terms = constants["n_terms"], constants["n_half_terms"]
+    result, start = {}, 0
+    for name, count in zip(FACTORS, (terms, half_terms, terms, half_terms), strict=True):
+        result[name] = slice(start, start + count)
+        start += count
+    return result
+
+
+def light_fade(w_light, cos_last):
+    """``min(1, cos θ / cos θ_last)``: P holds its last ring, B falls to zero at the horizon."""
+    if cos_last <= 1e-6:
+        return np.ones(np.shape(w_light)[:-1])
+    return np.minimum(np.asarray(w_light, float)[..., 2] / cos_last, 1)
+
+
+def decoded(array, dtype=float):
+    """Values of a stored map: uint8 codes are divided by 255."""
+    if array.dtype == np.uint8:
+        return array.astype(dtype) / dtype(255)
+    return array.astype(dtype)
+
+
+def batch_last(maps):
+    """Maps as factors: (texel, term, n, n, 3) -> (term, n², texel * 3)."""
+    k, terms, n = maps.shape[:3]
+    return np.ascontiguousarray(np.moveaxis(maps.reshape(k, terms, n * n, 3), 0, 2)).reshape(terms, n * n, k * 3)
+
+
+def texel_parts(n_texels, texels=None, size=32):
+    """Index arrays of at most ``size`` texels: small enough for their tables to stay in cache."""
+    texels = np.arange(n_texels) if texels is None else texels
+    return [texels[start : start + size] for start in range(0, n_texels, size)]

@@ -1,0 +1,76 @@
+"""Dr.Jit port of :mod:`btfref.representations.factored`: products of parabolic maps, for ``cmf`` and ``hf``."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from btfref.representations.factored import FACTORS, index_slots
+from mitsuba_plugins.lookup import read_packets, texel_stencil
+from mitsuba_plugins.parabolic import ParabolicMaps, bilinear_stencil, half_difference
+
+
+class Evaluator:
+    """Multiplies the maps that each texel's index names, and blends texels."""
+
+    def __init__(self, maps):
+        self.shape, self.filter_type = maps.shape, maps.filter_type
+        self.constants = maps.meta["constants"]
+        self.slots = index_slots(self.constants)
+        self.update(maps)
+
+    def update(self, maps):
+        """Take over changed maps."""
+        tensors = maps.tensors
+        self.factors = {
+            name: ParabolicMaps(tensors[f"factor_{name}"]) for name in FACTORS if f"factor_{name}" in tensors
+        }
+        self.index, self.index_stride = mi.UInt32(tensors["index"].array), tensors["index"].shape[-1]
+        self.scale, self.half_scale = tensors["scale_map"], tensors.get("half_scale")
+        self.peak = tensors["scale_peak"].array
+
+    @staticmethod
+    def _colour(tensor, at, active):
+        """Colour ``at`` of a map of scales."""
+        if dr.is_integral_v(tensor.array):
+            word = dr.gather(mi.UInt32, mi.UInt32(tensor.array), at, active)
+            return mi.Color3f(*(mi.Float((word >> shift) & 255) for shift in (0, 8, 16))) * (1 / 255)
+        return mi.Color3f(*(mi.Float(c) for c in read_packets(tensor.array, at, 4, active)[:3]))
+
+    def _value(self, texel, stencils, active):
+        """B of one texel but for the fall to the horizon."""
+
+        def read(name, term):
+            slot = texel * self.index_stride + self.slots[name].start + term
+            prototype = dr.gather(mi.UInt32, self.index, slot, active)
+            return self.factors[name].lookup(prototype, stencils[name], active)
+
+        n_terms, n_half_terms = self.constants["n_terms"], self.constants["n_half_terms"]
+        in_out = mi.Color3f(0)
+        for k in range(n_terms):
+            peak = dr.gather(mi.Vector4f, self.peak, mi.UInt32(k))
+            scale = self._colour(self.scale, texel * n_terms + k, active) * mi.Color3f(peak.x, peak.y, peak.z)
+            in_out += scale * read("p", k) * read("r", k)
+        half = mi.Color3f(0)
+        for j in range(n_half_terms):
+            term = read("q", j)
+            if "d" in self.factors:
+                term *= read("d", j)
+            if self.half_scale is not None:
+                term *= self._colour(self.half_scale, texel * n_half_terms + j, active)
+            half += term
+        return in_out * half
+
+    def evaluate(self, uv, w_light, w_view, active):
+        """B in 1/sr for valid directions; never negative."""
+        h, d = half_difference(w_light, w_view)
+        stencils = {
+            name: bilinear_stencil(w, self.factors[name].n)
+            for name, w in zip(FACTORS, (w_light, h, w_view, d), strict=True)
+            if name in self.factors
+        }
+        total = mi.Color3f(0)
+        for texel, share in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True):
+            total += self._value(texel, stencils, active) * share
+        cos_last = self.constants["light_cos_last"]
+        return total * dr.minimum(w_light.z / cos_last, 1) if cos_last > 1e-6 else total
