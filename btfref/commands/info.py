@@ -117,13 +117,14 @@ def lines(facts, indent=""):
 
 def _short(fact):
     """Whether a nested fact (a map, a direction set) fits one line."""
-    return set(fact) in ({"dtype", "shape"}, {"name", "count"})
+    return set(fact) in ({"dtype", "shape", "bytes"}, {"name", "count"})
 
 
 def _text(key, fact):
     if isinstance(fact, dict) and fact:
         shape = fact.get("shape")
-        return f"{fact['dtype']}  {_text('shape', shape)}" if shape else f"{fact['name']} ({fact['count']})"
+        size = f", {bytes_text(fact['bytes'])}" if shape else ""
+        return f"{fact['dtype']}  {_text('shape', shape)}{size}" if shape else f"{fact['name']} ({fact['count']})"
     if key in _BYTES and fact is not None:
         return bytes_text(fact)
     if key == "ratio" and fact is not None:

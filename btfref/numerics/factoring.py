@@ -18,6 +18,9 @@ TINY = np.float32(1e-18)
 #: Alternating steps of one term: the second singular value is at most about half the first, 2^-30 = 1e-9.
 RANK_ONE_STEPS = 30
 
+#: Share of a table's mean that is added to its values when they weigh their own errors.
+WEIGHT_FLOOR = 0.1
+
 #: Joint sweeps over several terms.
 TERM_SWEEPS = 20
 
@@ -106,8 +109,12 @@ def rank_terms(data, weight, terms):
         return data - known[..., None] * np.einsum("kam,kbm->abm", left[others], right[others])
 
     def improve(k, residual):
-        left[k] = np.maximum(np.einsum("abm,bm->am", residual, right[k]), 0) / np.maximum(known @ right[k] ** 2, TINY)
-        right[k] = np.maximum(np.einsum("abm,am->bm", residual, left[k]), 0) / np.maximum(known.T @ left[k] ** 2, TINY)
+        left[k] = np.maximum(np.einsum("abm,bm->am", residual, right[k]), 0) / np.maximum(
+            known @ right[k] ** 2, TINY
+        )
+        right[k] = np.maximum(np.einsum("abm,am->bm", residual, left[k]), 0) / np.maximum(
+            known.T @ left[k] ** 2, TINY
+        )
 
     for k in range(terms):
         residual = rest(k)
@@ -120,8 +127,21 @@ def rank_terms(data, weight, terms):
     return left, right
 
 
-def refine(data, factors, operators, sweeps):
-    """Sweeps of multiplicative updates towards the least squared error of the product itself.
+def sample_weights(data, exponent):
+    """Weights of samples' squared errors, ``(data + WEIGHT_FLOOR)^−exponent``.
+
+    Parameters
+    ----------
+    data : ndarray
+        Tables of mean 1.
+    exponent : float
+        0: absolute errors, ruled by highlights; 2: relative errors, ruled by shadows.
+    """
+    return (data + np.float32(WEIGHT_FLOOR)) ** np.float32(-exponent)
+
+
+def refine(data, factors, operators, sweeps, weight=1):
+    """Sweeps of multiplicative updates towards the least weighted squared error of the product itself.
 
     Lee and Seung 2001, with the other factors and the reading of the maps as known linear operators: each update keeps
     factors non-negative and the error from growing.
@@ -133,6 +153,7 @@ def refine(data, factors, operators, sweeps):
         "p", "q", "r" and perhaps "d", shape (term, n, m); not changed.
     operators : FactorOperators
     sweeps : int
+    weight : ndarray like ``data``, or 1
 
     Returns
     -------
@@ -143,20 +164,24 @@ def refine(data, factors, operators, sweeps):
     def update(name, numerator, denominator):
         operator = getattr(operators, name).T
         factors[name] = factors[name] * np.stack(
-            [(operator @ n) / np.maximum(operator @ d, TINY) for n, d in zip(numerator, denominator, strict=True)]
+            [
+                (operator @ n) / np.maximum(operator @ d, TINY)
+                for n, d in zip(numerator, denominator, strict=True)
+            ]
         )
 
+    data = weight * data
     in_out = operators.in_out(factors)
     for _ in range(sweeps):
         half = operators.half(factors)
-        x, y = data * half, half * half
+        x, y = data * half, weight * half * half
         r = operators.read("r", factors["r"])
         update("p", np.einsum("vlm,kvm->klm", x, r), np.einsum("vlm,kvm->klm", y * in_out, r))
         in_out = operators.in_out(factors)
         p = operators.read("p", factors["p"])
         update("r", np.einsum("vlm,klm->kvm", x, p), np.einsum("vlm,klm->kvm", y * in_out, p))
         in_out = operators.in_out(factors)
-        x, y = data * in_out, in_out * in_out
+        x, y = data * in_out, weight * in_out * in_out
         names = "q" if operators.d is None else "qd"
         for name, other in zip(names, names[::-1], strict=True):
             a, b = x.reshape(-1, x.shape[-1]), (y * operators.half(factors)).reshape(-1, x.shape[-1])

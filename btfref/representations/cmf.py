@@ -12,7 +12,14 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.directions import DirectionSet, ring_directions
-from btfref.numerics.factoring import TINY, FactorOperators, rank_terms, refine, sparse_operator
+from btfref.numerics.factoring import (
+    TINY,
+    FactorOperators,
+    rank_terms,
+    refine,
+    sample_weights,
+    sparse_operator,
+)
 from btfref.numerics.halfway import half_difference, in_out
 from btfref.numerics.parabolic import texel_directions
 from btfref.representations.factored import Representation, light_fade, texel_parts
@@ -21,8 +28,8 @@ from btfref.representations.lookup import positive_integer
 
 __all__ = ["PRESETS", "Representation", "fit"]
 
-#: "paper": factors as the chain leaves them, 8 bits, scales from the normalisation alone.
-PRESETS = {"paper": {"sweeps": 0, "rescale": False, "storage": "byte"}}
+#: "paper": factors as the chain leaves them, all in 8 bits, scales from the normalisation alone.
+PRESETS = {"paper": {"sweeps": 0, "rescale": False, "storage": "byte", "scale_storage": "byte"}}
 
 #: Step of the difference directions in degrees: the paper's 8 polar angles.
 DIFFERENCE_STEP = 11.25
@@ -37,7 +44,8 @@ def ring_set(step):
     polar = np.arange(1, n + 1) * (90 / n)
     counts = np.maximum(6, np.round(np.sin(np.radians(polar)) * 360 / step)).astype(int)
     return DirectionSet(
-        ring_directions([(0, 1, 0), *((float(p), int(c), 0) for p, c in zip(polar, counts, strict=True))]), "rings"
+        ring_directions([(0, 1, 0), *((float(p), int(c), 0) for p, c in zip(polar, counts, strict=True))]),
+        "rings",
     )
 
 
@@ -117,11 +125,15 @@ class Resampling:
         back = np.zeros_like(data.reshape(-1, data.shape[-1]))
         for i in range(h.shape[1]):
             for j in range(d.shape[1]):
-                back += (h_weight[:, i] * d_weight[:, j]).astype(np.float32)[:, None] * there[h[:, i], d[:, j]]
+                back += (h_weight[:, i] * d_weight[:, j]).astype(np.float32)[:, None] * there[
+                    h[:, i], d[:, j]
+                ]
 
         def relative(test, reference):
             energy = float((reference.astype(float) ** 2).sum())
-            return float(np.sqrt(((test - reference).astype(float) ** 2).sum() / energy)) if energy > 0 else 0.0
+            return (
+                float(np.sqrt(((test - reference).astype(float) ** 2).sum() / energy)) if energy > 0 else 0.0
+            )
 
         result = {"half_difference": relative(back, data.reshape(back.shape))}
         for name, factor in factors.items():
@@ -168,12 +180,14 @@ def fit(
     progress=None,
     difference=False,
     terms=1,
-    sweeps=6,
+    sweeps=8,
+    exponent=0.75,
     floor=1e-3,
     half_step=5.0,
     map_size=32,
     clusters=256,
     storage="half",
+    scale_storage=None,
     rescale=True,
     filter_type="bilinear",
 ):
@@ -192,9 +206,12 @@ def fit(
     terms : int
         Non-negative terms of each matrix decomposition, at least 1.
     sweeps : int
-        Multiplicative updates of all factors after the chain, towards the least squared error of the product as the
-        maps give it. Differs from the paper, which stops after the chain (0): the residue's decomposition weighs
-        every sample of the quotient alike, however small the product is there.
+        Multiplicative updates of all factors after the chain, towards the least weighted squared error of the product
+        as the maps give it. Differs from the paper, which stops after the chain (0): the residue's decomposition
+        weighs every sample of the quotient alike, however small the product is there.
+    exponent : float
+        Squared errors of the updates and of the scales count (B / mean + 0.1)^−exponent: 0 favours highlights and
+        the RMSE, 2 shadows and the relative error.
     floor : float
         Share of its mean below which the half-vector approximation is held when the data are divided by it.
     half_step : float
@@ -204,6 +221,9 @@ def fit(
     clusters : int or None
         Largest codebook of each factor; None: no clustering.
     storage : {"half", "float", "byte"}
+    scale_storage : {"half", "float", "byte"}, optional
+        Of the scale map. None: that of the maps, but half for "byte". Differs from the paper, whose scale map has 8
+        bits too: scales of texels with and without highlights differ by more than 255.
     rescale : bool
         Fit the scales to the data again with the stored maps.
     filter_type : {"bilinear", "nearest"}
@@ -219,13 +239,20 @@ def fit(
     InputError
         For parameters out of range, or a value that is not finite.
     """
-    check_parameters(clusters=clusters, storage=storage)
+    check_parameters(clusters=clusters, storage=storage, scale_storage=scale_storage)
     terms, map_size = positive_integer("terms", terms), positive_integer("map_size", map_size)
     if map_size < 2:
         raise InputError("a parameter is out of range", field="map_size", got=map_size, expected="at least 2")
-    for name, value, low, high in (("floor", floor, 0, 1), ("half_step", half_step, 0.5, 90), ("sweeps", sweeps, 0, 1000)):
+    for name, value, low, high in (
+        ("floor", floor, 0, 1),
+        ("half_step", half_step, 0.5, 90),
+        ("sweeps", sweeps, 0, 1000),
+        ("exponent", exponent, 0, 2),
+    ):
         if not low <= value <= high:
-            raise InputError("a parameter is out of range", field=name, got=value, expected=f"{low} to {high}")
+            raise InputError(
+                "a parameter is out of range", field=name, got=value, expected=f"{low} to {high}"
+            )
     rows, columns = btf.values.shape[2:4]
     n_texels = rows * columns
     parts = texel_parts(n_texels)
@@ -247,7 +274,7 @@ def fit(
         squared["factors"] += _squared_error(data, resampling.measured.product(factors), mean)
         if step % max(1, len(parts) // 4) == 0 and len(probes) * len(texels) < N_PROBED:
             probes.append(resampling.errors(data, factors))
-        factors = refine(data, factors, resampling.through_maps, sweeps)
+        factors = refine(data, factors, resampling.through_maps, sweeps, sample_weights(data, exponent))
         squared["maps"] += _squared_error(data, resampling.through_maps.product(factors), mean)
         factors["p"] = factors["p"] * mean
         for name in names:
@@ -258,11 +285,13 @@ def fit(
         "difference": difference,
         "terms": terms,
         "sweeps": sweeps,
+        "exponent": exponent,
         "floor": floor,
         "half_step": half_step,
         "map_size": map_size,
         "clusters": clusters,
         "storage": storage,
+        "scale_storage": scale_storage,
         "rescale": rescale,
         "seed": seed,
     }
@@ -274,7 +303,9 @@ def fit(
         parameters,
         clusters=clusters,
         storage=storage,
+        scale_storage=scale_storage,
         rescale=rescale,
+        exponent=exponent,
         seed=seed,
         filter_type=filter_type,
         report=lambda label: report(next(labels), steps, label),
@@ -286,4 +317,3 @@ def fit(
 
 def _squared_error(data, model, mean):
     return float((((model - data) * mean).astype(float) ** 2).sum())
-

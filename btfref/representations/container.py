@@ -129,9 +129,9 @@ def read_info(path):
     -------
     dict
         ``kind``, ``method``, ``shape`` [views, lights, rows, columns, 3] of the BTF it stands for, ``directions``,
-        ``maps``, ``payload_bytes`` (the maps alone, counted as the papers count: no direction tables, an index map
-        at the width its codebook needs), ``file_bytes``, ``raw_bytes`` (the BTF as 32-bit floats), ``ratio``,
-        ``parameters``, ``parent``, ``versions``.
+        ``maps`` with the shape, type and bytes of each, ``payload_bytes`` (the maps alone, counted as the papers
+        count: no direction tables, an index map at the width its codebook needs), ``file_bytes``, ``raw_bytes`` (the
+        BTF as 32-bit floats), ``ratio``, ``parameters``, ``parent``, ``versions``.
     """
     manifest, parts = _open(path, header_only=True)
     meta, maps = manifest["meta"], manifest["arrays"]
@@ -140,7 +140,8 @@ def read_info(path):
             raise InputError("a map is missing", file=path, field=name)
     views, lights = meta["views"], meta["lights"]
     shape = [views["count"], lights["count"], *meta["texels"], 3]
-    payload = payload_bytes({name: (entry["shape"], entry["dtype"]) for name, entry in maps.items()}, meta)
+    maps = {name: {**entry, "bytes": map_bytes(name, **entry, meta=meta)} for name, entry in maps.items()}
+    payload = sum(entry["bytes"] for name, entry in maps.items() if not name.startswith(("view_", "light_")))
     raw = 4 * int(np.prod(shape, dtype=np.int64))
     return {
         "kind": "representation",
@@ -159,22 +160,19 @@ def read_info(path):
     }
 
 
-def payload_bytes(maps, meta):
-    """Bytes of the maps alone.
+def map_bytes(name, shape, dtype, meta):
+    """Bytes of one map.
 
     Parameters
     ----------
-    maps : dict of str to (shape, dtype name)
+    name : str
+    shape : sequence of int
+    dtype : str
     meta : dict
         ``index_bytes`` maps the name of an index map to the bytes that one index needs.
     """
-    total = 0
-    for name, (shape, dtype) in maps.items():
-        if name.startswith(("view_", "light_")):
-            continue
-        width = meta.get("index_bytes", {}).get(name, np.dtype(dtype).itemsize)
-        total += width * int(np.prod(shape, dtype=np.int64))
-    return total
+    width = meta.get("index_bytes", {}).get(name, np.dtype(dtype).itemsize)
+    return width * int(np.prod(shape, dtype=np.int64))
 
 
 def _image_size(shape):
@@ -250,6 +248,8 @@ def _read_map(path, name, entry, part):
         raise InputError("a map holds a value that is not finite", file=path, field=name)
     if byte:
         if ((result < 0) | (result > 1)).any():
-            raise InputError("an 8-bit map holds a value out of range", file=path, field=name, expected="[0, 1]")
+            raise InputError(
+                "an 8-bit map holds a value out of range", file=path, field=name, expected="[0, 1]"
+            )
         result = np.rint(result.astype(np.float32) * 255).astype(np.uint8)
     return result.reshape(shape)

@@ -4,7 +4,8 @@ Source: F. Suykens, K. vom Berge, A. Lagae, P. Dutré, "Interactive Rendering wi
 Eurographics 2003, sections 5 and 6: ``B(x, l, v) = S(x) P_{I.r(x)}(l) Q_{I.g(x)}(h) R_{I.b(x)}(v)``; in general
 ``Σ_k S_k P_k(l) R_k(v) · Σ_j T_j Q_j(h) D_j(d)``, each P, Q, R, D the map of a codebook that the texel's index names.
 Maps hold [0, 1]. Differs from the paper: B holds the light's cosine, so that a host does not multiply by it; the four
-texels around a lookup are evaluated and blended; the scale is fitted again to the stored maps.
+texels around a lookup are evaluated and blended; maps are clustered at equal RMS and their prototypes then scaled to a
+peak of 1; the scale is fitted again to the stored maps.
 """
 
 from __future__ import annotations
@@ -137,7 +138,9 @@ class Representation:
         n_texels = int(np.prod(self.meta["texels"]))
         views = self.maps["view_directions"].astype(float)
         lights = self.maps["light_directions"].astype(float)
-        some = map_operators(views[feature_views(len(views))], lights, self.maps["factor_p"].shape[1], "d" in self.names)
+        some = map_operators(
+            views[feature_views(len(views))], lights, self.maps["factor_p"].shape[1], "d" in self.names
+        )
         features = np.concatenate(
             [
                 np.moveaxis(conventions.luminance(self.tables(part, some)), -1, 0).reshape(len(part), -1)
@@ -192,7 +195,9 @@ def decoded(array, dtype=float):
 def batch_last(maps):
     """Maps as factors: (texel, term, n, n, 3) -> (term, n², texel * 3)."""
     k, terms, n = maps.shape[:3]
-    return np.ascontiguousarray(np.moveaxis(maps.reshape(k, terms, n * n, 3), 0, 2)).reshape(terms, n * n, k * 3)
+    return np.ascontiguousarray(np.moveaxis(maps.reshape(k, terms, n * n, 3), 0, 2)).reshape(
+        terms, n * n, k * 3
+    )
 
 
 def texel_parts(n_texels, texels=None, size=32):

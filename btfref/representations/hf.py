@@ -18,14 +18,17 @@ from btfref.representations.lookup import positive_integer
 
 __all__ = ["PRESETS", "Representation", "fit"]
 
-#: "paper": floats and 8 bits are compared there; scales come from the normalisation alone.
-PRESETS = {"paper": {"rescale": False, "storage": "byte"}}
+#: "paper": all in 8 bits, scales from the normalisation alone.
+PRESETS = {"paper": {"rescale": False, "storage": "byte", "scale_storage": "byte"}}
 
 #: Candidates for λ where none is given.
 SMOOTHNESS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 
 #: Texels and share of the samples that judge the candidates.
 N_JUDGED, HELD_OUT = 48, 0.2
+
+#: How errors weigh when the scales are fitted; see :func:`btfref.numerics.factoring.sample_weights`.
+EXPONENT = 0.75
 
 #: Weight of x̃ = 0 in the normal equations: constants can move between the factors freely, and this picks the smallest.
 RIDGE = 1e-6
@@ -129,6 +132,7 @@ def fit(
     map_size=32,
     clusters=256,
     storage="half",
+    scale_storage=None,
     rescale=True,
     filter_type="bilinear",
 ):
@@ -153,8 +157,10 @@ def fit(
     clusters : int or None
         Largest codebook of each factor; None: no clustering.
     storage : {"half", "float", "byte"}
+    scale_storage : {"half", "float", "byte"}, optional
+        Of the scale map. None: that of the maps, but half for "byte".
     rescale : bool
-        Fit the scales to the data by least squares with the stored maps.
+        Fit the scales to the data by weighted least squares with the stored maps, as :func:`cmf.fit` does.
     filter_type : {"bilinear", "nearest"}
 
     Returns
@@ -168,14 +174,18 @@ def fit(
     InputError
         For parameters out of range, or a value that is not finite.
     """
-    check_parameters(clusters=clusters, storage=storage)
+    check_parameters(clusters=clusters, storage=storage, scale_storage=scale_storage)
     map_size = positive_integer("map_size", map_size)
     if map_size < 2:
         raise InputError("a parameter is out of range", field="map_size", got=map_size, expected="at least 2")
     if not 0 < floor <= 1:
-        raise InputError("a parameter is out of range", field="floor", got=floor, expected="above 0, at most 1")
+        raise InputError(
+            "a parameter is out of range", field="floor", got=floor, expected="above 0, at most 1"
+        )
     if smoothness is not None and not 0 < smoothness < np.inf:
-        raise InputError("a parameter is out of range", field="smoothness", got=smoothness, expected="a number above 0")
+        raise InputError(
+            "a parameter is out of range", field="smoothness", got=smoothness, expected="a number above 0"
+        )
     report = progress or (lambda *_: None)
     n_texels = int(np.prod(btf.values.shape[2:4]))
     parts = texel_parts(n_texels)
@@ -214,6 +224,7 @@ def fit(
         "map_size": map_size,
         "clusters": clusters,
         "storage": storage,
+        "scale_storage": scale_storage,
         "rescale": rescale,
         "seed": seed,
     }
@@ -225,7 +236,9 @@ def fit(
         parameters,
         clusters=clusters,
         storage=storage,
+        scale_storage=scale_storage,
         rescale=rescale,
+        exponent=EXPONENT,
         seed=seed,
         filter_type=filter_type,
         report=lambda label: report(next(labels), steps, label),

@@ -1,0 +1,405 @@
+"""Factored BTFs: parabolic maps, half and difference vectors, the factorizations, storage, and bad data."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from oracle import oracle_btf
+
+from btfref.compare.tolerances import tolerance
+from btfref.errors import InputError
+from btfref.numerics import factoring, halfway, parabolic
+from btfref.numerics.directions import directions
+from btfref.registry import methods
+from btfref.representations import cmf, factored_fit, hf, load, read_info, save
+from btfref.sampling import SampledBTF
+
+KEYS = ("cmf", "hf")
+
+#: Small maps make a quick test.
+QUICK = {"cmf": {"map_size": 16, "half_step": 10.0}, "hf": {"map_size": 16, "smoothness": 0.3}}
+
+
+def fit(key, btf, **parameters):
+    return methods()[key].fit(btf, **{**QUICK[key], **parameters})
+
+
+def upper(rng, n):
+    w = rng.normal(size=(n, 3))
+    w[:, 2] = np.abs(w[:, 2]) + 1e-3
+    return w / np.linalg.norm(w, axis=1, keepdims=True)
+
+
+def product_btf(shape=(3, 4), difference=False):
+    """Texels whose tables are smooth products of factors, different per texel and channel."""
+    views = lights = directions("ubo81")
+    rows, columns = shape
+    h, d = halfway.half_difference(lights.vectors[None], views.vectors[:, None])
+    x = np.linspace(0, 1, rows * columns * 3).reshape(rows, columns, 3)
+    p = lights.vectors[:, 2, None, None, None] * (1 + 0.5 * x * lights.vectors[:, 0, None, None, None])
+    r = 1 - 0.4 * x * views.vectors[:, 1, None, None, None]
+    q = 0.2 + np.exp(-2 * (1 - h[..., 2]))[..., None, None, None] * (1 + x)
+    values = r[:, None] * p[None] * q
+    if difference:
+        values = values * (0.3 + d[..., 2, None, None, None] ** 2)
+    return SampledBTF(values.astype(np.float32), views, lights)
+
+
+# --- parabolic maps and half vectors -------------------------------------------------------------------------------
+
+
+def test_parabolic_lookup_is_exact_at_texels(rng):
+    n = 16
+    table = rng.random((n, n))
+    inside = np.linalg.norm(parabolic.texel_centres(n), axis=-1) <= 1
+    index, weight = parabolic.bilinear_stencil(parabolic.texel_directions(n)[inside], n)
+    value = (table.reshape(-1)[index] * weight).sum(-1)
+    np.testing.assert_allclose(value, table[inside], atol=tolerance("metric.closed_form.atol"))
+
+
+def test_parabolic_lookup_is_linear_in_the_square_and_ignores_length(rng):
+    n, w = 16, upper(rng, 1000)
+    st = parabolic.hemisphere_to_square(w)
+    centres = parabolic.texel_centres(n).reshape(-1, 2)
+    index, weight = parabolic.bilinear_stencil(w * rng.uniform(0.1, 9, (1000, 1)), n)
+    within = np.abs(st).max(1) < 1 - 1 / n
+    found = np.einsum("ij,ijk->ik", weight, centres[index])
+    np.testing.assert_allclose(found[within], st[within], atol=tolerance("metric.closed_form.atol"))
+    np.testing.assert_allclose(weight.sum(1), 1)
+    assert (weight >= 0).all()
+
+
+def test_texel_solid_angles_cover_the_hemisphere():
+    angles = parabolic.texel_solid_angles(32)
+    np.testing.assert_allclose(angles.sum(), 2 * np.pi)
+    cosine = (angles * parabolic.texel_directions(32)[..., 2]).sum()
+    assert abs(cosine - np.pi) <= tolerance("factored.solid_angle.relative") * np.pi
+
+
+def test_half_and_difference_vectors_are_inverted(rng):
+    w_light, w_view = upper(rng, 2000), upper(rng, 2000)
+    h, d = halfway.half_difference(w_light, w_view)
+    assert (h[:, 2] > 0).all()
+    assert (d[:, 2] >= 0).all()
+    back = halfway.in_out(h, d)
+    np.testing.assert_allclose(back[0], w_light, atol=tolerance("metric.library.atol"))
+    np.testing.assert_allclose(back[1], w_view, atol=tolerance("metric.library.atol"))
+
+
+def test_half_frame_is_orthonormal_everywhere(rng):
+    h = np.concatenate([upper(rng, 500), [[1, 0, 0], [0, 1, 0], [0, 0, 1.0]]])
+    frame = np.stack([*halfway.half_frame(h), h], 1)
+    np.testing.assert_allclose(
+        frame @ np.swapaxes(frame, 1, 2),
+        np.broadcast_to(np.eye(3), frame.shape),
+        atol=tolerance("metric.library.atol"),
+    )
+
+
+# --- factorizations ----------------------------------------------------------------------------------------------
+
+
+def test_one_term_is_the_first_singular_pair(rng):
+    data = rng.random((20, 15, 4))
+    left, right = factoring.rank_terms(data, None, 1)
+    for i in range(4):
+        u, s, v = np.linalg.svd(data[..., i])
+        best = s[0] * np.outer(u[:, 0], v[0])
+        np.testing.assert_allclose(
+            np.outer(left[0, :, i], right[0, :, i]), best, rtol=tolerance("factored.svd.rtol")
+        )
+
+
+def test_more_terms_fit_better_and_stay_positive(rng):
+    data = np.einsum("kam,kbm->abm", rng.random((3, 20, 5)), rng.random((3, 15, 5)))
+    errors = []
+    for terms in (1, 2, 3):
+        left, right = factoring.rank_terms(data, None, terms)
+        assert min(left.min(), right.min()) >= 0
+        errors.append(((np.einsum("kam,kbm->abm", left, right) - data) ** 2).sum())
+    assert errors[0] > errors[1] > errors[2]
+
+
+def test_unknown_samples_do_not_matter(rng):
+    data = np.einsum("am,bm->abm", 1 + rng.random((20, 5)), 1 + rng.random((15, 5)))
+    known = (rng.random((20, 15)) < 0.7).astype(float)
+    left, right = factoring.rank_terms(data * known[..., None], known, 1)
+    np.testing.assert_allclose(left[0][:, None] * right[0][None], data, rtol=tolerance("factored.svd.rtol"))
+
+
+def test_sweeps_never_raise_the_error():
+    btf = oracle_btf((2, 3))
+    resampling = cmf.Resampling(btf.views, btf.lights, 10.0, 16, True)
+    data, _ = factored_fit.unit_tables(btf, np.arange(6))
+    factors = cmf.chain(data, resampling, 2, 1e-3)
+    errors = []
+    for _ in range(5):
+        errors.append(((resampling.through_maps.product(factors) - data) ** 2).sum(dtype=float))
+        factors = factoring.refine(data, factors, resampling.through_maps, 1)
+        assert min(f.min() for f in factors.values()) >= 0
+    assert (np.diff(errors) < 0).all()
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_products_are_recovered(key):
+    """Data that are a product of three smooth factors leave the error of maps and half floats alone."""
+    fitted = methods()[key].fit(product_btf(), **({"smoothness": 0.03} if key == "hf" else {"sweeps": 20}))
+    assert fitted.meta["fit"]["error"] <= tolerance(f"factored.product.{key}")
+
+
+def test_chain_alone_recovers_a_product():
+    """Without refinement; the mean over difference directions sees P and R too, so the error is larger."""
+    fitted = cmf.fit(product_btf(), sweeps=0)
+    assert fitted.meta["fit"]["error"] <= tolerance("factored.product.chain")
+
+
+def test_four_factors_and_more_terms_pay():
+    btf = product_btf(difference=True)
+    errors = {
+        name: fit("cmf", btf, **kw).meta["fit"]["error"]
+        for name, kw in {
+            "three": {},
+            "four": {"difference": True},
+            "both": {"difference": True, "terms": 2},
+        }.items()
+    }
+    assert errors["four"] < errors["three"]
+    assert errors["both"] < errors["three"]
+
+
+def test_division_is_floored():
+    """Where the half-vector approximation vanishes, the residue is at most the data over the floor."""
+    btf = product_btf()
+    data, _ = factored_fit.unit_tables(btf, np.arange(12))
+    resampling = cmf.Resampling(btf.views, btf.lights, 10.0, 16, False)
+    # A single bright pair that no half/difference sample hits leaves Q at zero there.
+    spike = np.zeros_like(data)
+    spike[80, 1] = 1000
+    for floor in (1e-3, 1e-1):
+        for table in (spike, np.where(data > 1, data, 0)):
+            factors = cmf.chain(table, resampling, 1, floor)
+            product = resampling.measured.product(factors)
+            assert np.isfinite(product).all()
+            half = resampling.measured.half(factors)
+            bound = table.max((0, 1)) / np.maximum(floor * half.mean((0, 1)), factoring.TINY)
+            largest = (factors["p"][0].max(0) * factors["r"][0].max(0)) / np.sqrt(
+                data.shape[0] * data.shape[1]
+            )
+            assert (largest <= bound * (1 + tolerance("factored.svd.rtol"))).all()
+
+
+def test_resampling_errors_are_measured():
+    error = fit("cmf", oracle_btf((4, 4))).meta["fit"]["resampling"]
+    assert set(error) == {"half_difference", "parabolic_p", "parabolic_q", "parabolic_r"}
+    finer = cmf.fit(oracle_btf((4, 4)), map_size=64, half_step=5.0).meta["fit"]["resampling"]
+    assert finer["parabolic_r"] < error["parabolic_r"]
+    assert finer["half_difference"] < error["half_difference"]
+
+
+def test_hf_factors_its_matrix_once_and_chooses_the_best_smoothness(monkeypatch):
+    calls = []
+    factorize = hf.LogSystem.factorize
+    monkeypatch.setattr(hf.LogSystem, "factorize", lambda self, *a: calls.append(a) or factorize(self, *a))
+    btf = oracle_btf((10, 8))
+    hf.fit(btf, map_size=12, smoothness=1.0)
+    assert len(calls) == 1
+    found = hf.fit(btf, map_size=12).meta["fit"]
+    assert len(calls) == 1 + len(hf.SMOOTHNESS) + 1
+    assert found["held_out"][str(found["smoothness"])] == min(found["held_out"].values())
+
+
+def test_eight_bits_hardly_touch_cmf():
+    btf = oracle_btf((12, 10))
+    for parameters in ({}, {"sweeps": 0, "rescale": False}):
+        error = {
+            s: fit("cmf", btf, storage=s, **parameters).meta["fit"]["error"] ** 0.5 for s in ("float", "byte")
+        }
+        assert error["byte"] <= tolerance("factored.eight_bits.ratio") * error["float"]
+
+
+# --- storage -----------------------------------------------------------------------------------------------------
+
+
+def sparse_btf(shape, dtype="float16"):
+    """Many texels, few directions."""
+    w = directions("ubo81").vectors[[0, 1, 3, 5]]
+    return oracle_btf(shape, w, w, dtype)
+
+
+def test_byte_counts_are_those_of_the_paper(tmp_path):
+    """2.25 MiB for three codebooks of 256 maps of 32² RGB bytes, 36 MiB unclustered for 64² texels."""
+    btf = sparse_btf((64, 64))
+    for clusters, mebibytes in ((256, 2.25), (None, 36)):
+        fitted = cmf.fit(btf, clusters=clusters, storage="byte", scale_storage="byte", sweeps=0)
+        path = tmp_path / f"{clusters}.cmf.exr"
+        save(fitted, path)
+        info = read_info(path)
+        books = {name: m for name, m in info["maps"].items() if name.startswith("factor_")}
+        assert sum(m["bytes"] for m in books.values()) == mebibytes * 2**20
+        width = 1 if clusters else 2
+        assert info["maps"]["index"]["bytes"] == 64 * 64 * 3 * width
+        assert info["maps"]["scale_map"]["bytes"] == 64 * 64 * 3
+        assert info["payload_bytes"] == mebibytes * 2**20 + 64 * 64 * 3 * (width + 1) + 12
+
+
+@pytest.mark.parametrize("storage", ["float", "half", "byte"])
+@pytest.mark.parametrize("key", KEYS)
+def test_files_keep_every_value(key, storage, tmp_path):
+    fitted = fit(key, sparse_btf((5, 6)), storage=storage, clusters=8)
+    save(fitted, tmp_path / "a.exr")
+    back = load(tmp_path / "a.exr")
+    assert (
+        fitted.maps["factor_q"].dtype == {"float": np.float32, "half": np.float16, "byte": np.uint8}[storage]
+    )
+    for name, array in fitted.arrays().items():
+        assert back.maps[name].dtype == array.dtype
+        np.testing.assert_array_equal(back.maps[name], array)
+    assert back.meta == fitted.meta
+
+
+def test_codebooks_are_bounded_and_deterministic():
+    btf = oracle_btf((9, 8))
+    a, b = (fit("cmf", btf, clusters=10, seed=3) for _ in range(2))
+    for name in a.maps:
+        np.testing.assert_array_equal(a.maps[name], b.maps[name])
+    assert len(a.maps["factor_p"]) <= 10
+    assert a.maps["index"].max() < 10
+    every = fit("cmf", btf, clusters=None)
+    assert every.meta["fit"]["error"] < a.meta["fit"]["error"]
+
+
+def alternating(fitted):
+    """Slices of 0 and 1 in turn, every texel on a slice of ones: any leak between slices darkens it."""
+    maps = dict(fitted.maps)
+    for name in ("factor_p", "factor_q", "factor_r"):
+        ones = np.ones_like(maps[name]) * (255 if maps[name].dtype == np.uint8 else 1)
+        maps[name] = ones * (np.arange(len(ones)) % 2).astype(ones.dtype)[:, None, None, None]
+    maps["index"] = np.minimum(maps["index"] | 1, len(maps["factor_p"]) - 1).astype(np.uint32) | 1
+    top = 255 if maps["scale_map"].dtype == np.uint8 else 1
+    maps["scale_map"] = np.full_like(maps["scale_map"], top)
+    maps["scale_peak"] = np.ones_like(maps["scale_peak"])
+    return dataclasses.replace(fitted, maps=maps)
+
+
+@pytest.mark.parametrize("storage", ["half", "byte"])
+def test_no_slice_leaks_into_another(storage, llvm, need, rng, tmp_path):
+    import drjit as dr
+    import mitsuba_plugins
+    from btfref.render.probe import probe
+
+    need("gl")
+    fitted = alternating(fit("cmf", oracle_btf((6, 6)), clusters=8, storage=storage))
+    assert len(fitted.maps["factor_p"]) == 8
+    w = upper(rng, 4000).astype(np.float32)
+    w_view = upper(rng, 4000).astype(np.float32)
+    uv = rng.random((4000, 2)).astype(np.float32)
+    expected = np.minimum(w[:, 2:] / fitted.meta["constants"]["light_cos_last"], 1) * np.ones(3)
+    save(fitted, tmp_path / "a.exr")
+    mitsuba_plugins.register()
+    bsdf = llvm.load_dict({"type": "btf", "filename": str(tmp_path / "a.exr")})
+    si = dr.zeros(llvm.SurfaceInteraction3f, len(uv))
+    si.uv, si.wi = llvm.Point2f(uv.T), llvm.Vector3f(w_view.T)
+    port = np.array(bsdf.eval(llvm.BSDFContext(), si, llvm.Vector3f(w.T))).T
+    for value in (fitted.evaluate(uv, w, w_view), probe(fitted, uv, w, w_view), port):
+        np.testing.assert_allclose(value, expected, atol=tolerance("probe.agreement.p999"))
+
+
+# --- bad data ----------------------------------------------------------------------------------------------------
+
+
+def spoiled(kind, rng):
+    btf = oracle_btf((4, 5), dtype="float32")
+    values = btf.values.copy()
+    if kind == "zeros":
+        values[:] = 0
+    elif kind == "black texels":
+        values[:, :, 1:3] = 0
+    elif kind == "black channel":
+        values[..., 2] = 0
+    elif kind == "constant":
+        values[:] = 0.25
+    elif kind == "negative noise":
+        values -= 0.05 * rng.random(values.shape).astype(np.float32)
+    elif kind == "mostly zero":
+        values[rng.random(values.shape) < 0.9] = 0
+    elif kind == "tiny":
+        values *= 1e-30
+    elif kind == "huge":
+        values *= 1e30
+    return dataclasses.replace(btf, values=values)
+
+
+BAD = ("zeros", "black texels", "black channel", "constant", "negative noise", "mostly zero", "tiny", "huge")
+
+
+@pytest.mark.parametrize("storage", ["float", "byte"])
+@pytest.mark.parametrize("kind", BAD)
+@pytest.mark.parametrize("key", KEYS)
+def test_bad_data_give_finite_values(key, kind, storage, rng):
+    btf = spoiled(kind, rng)
+    fitted = fit(key, btf, storage=storage, clusters=6)
+    for array in fitted.arrays().values():
+        assert np.isfinite(array).all()
+    value = fitted.evaluate(rng.random((500, 2)), upper(rng, 500), upper(rng, 500))
+    assert np.isfinite(value).all()
+    assert (value >= 0).all()
+    group, mean = fitted.sampling_tables()
+    assert np.isfinite(mean).all()
+    assert group.shape == btf.texels
+    nearest = dataclasses.replace(fitted, meta=fitted.meta | {"filter_type": "nearest"})
+    if kind == "zeros":
+        assert (value == 0).all()
+    if kind == "black texels":
+        assert (nearest.evaluate([[0.5, 0.5]], btf.lights.vectors, btf.views.vectors) == 0).all()
+    if kind == "black channel":
+        assert (value[:, 2] == 0).all()
+    if kind == "constant" and storage == "float":
+        measured = fitted.evaluate([[0.5, 0.5]], btf.lights.vectors, btf.views.vectors)
+        np.testing.assert_allclose(measured, 0.25, rtol=tolerance("factored.constant.rtol"))
+
+
+@pytest.mark.parametrize("key", KEYS)
+@pytest.mark.parametrize("views", ["pole", "four", "scattered", "10x5"])
+def test_sparse_direction_sets(key, views, rng):
+    spec = {
+        "pole": np.array([[0, 0, 1.0]]),
+        "four": directions("ubo81").vectors[[0, 1, 3, 5]],
+        "scattered": upper(rng, 12),
+        "10x5": "10x5",
+    }[views]
+    btf = oracle_btf((3, 3), spec, "ubo81" if views == "pole" else spec)
+    fitted = fit(key, btf)
+    value = fitted.evaluate(rng.random((500, 2)), upper(rng, 500), upper(rng, 500))
+    assert np.isfinite(value).all()
+    assert value.max() <= tolerance("factored.sparse.overshoot") * float(btf.values.max())
+
+
+@pytest.mark.parametrize("key", KEYS)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_values_that_are_not_finite_are_refused(key, value):
+    btf = oracle_btf((2, 2))
+    values = btf.values.copy()
+    values[3, 4, 1, 1, 0] = value
+    with pytest.raises(InputError, match="not finite"):
+        fit(key, dataclasses.replace(btf, values=values))
+
+
+@pytest.mark.parametrize(
+    ("key", "name", "value"),
+    [
+        ("cmf", "clusters", 0),
+        ("cmf", "storage", "double"),
+        ("cmf", "terms", 0),
+        ("cmf", "sweeps", -1),
+        ("cmf", "floor", 2.0),
+        ("cmf", "half_step", 0.0),
+        ("cmf", "map_size", 1),
+        ("hf", "smoothness", 0.0),
+        ("hf", "floor", 0.0),
+        ("hf", "map_size", 1),
+        ("hf", "clusters", 1.5),
+    ],
+)
+def test_parameters_out_of_range_are_refused(key, name, value):
+    with pytest.raises(InputError, match=name):
+        fit(key, oracle_btf((2, 2)), **{name: value})
