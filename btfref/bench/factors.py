@@ -1,7 +1,7 @@
 """Factored BTFs: speed of the factorizations and of clustering, and what 8-bit maps cost.
 
-Suykens et al. 2003 report, for one texel of 4096 samples and one channel, 33 s with homomorphic factorization and 8 s with
-chained matrix factorization, 35 minutes of clustering for 4096 texels, and that 8-bit maps spoil the former only.
+Suykens et al. 2003 report, for one texel of 4096 samples and one channel, 33 s with homomorphic factorization and 8 s
+with chained matrix factorization, 35 minutes of clustering for 4096 texels, and that 8-bit maps spoil the former only.
 """
 
 from __future__ import annotations

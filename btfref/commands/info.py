@@ -124,7 +124,11 @@ def _text(key, fact):
     if isinstance(fact, dict) and fact:
         shape = fact.get("shape")
         size = f", {bytes_text(fact['bytes'])}" if shape else ""
-        return f"{fact['dtype']}  {_text('shape', shape)}{size}" if shape else f"{fact['name']} ({fact['count']})"
+        return (
+            f"{fact['dtype']}  {_text('shape', shape)}{size}"
+            if shape
+            else f"{fact['name']} ({fact['count']})"
+        )
     if key in _BYTES and fact is not None:
         return bytes_text(fact)
     if key == "ratio" and fact is not None:

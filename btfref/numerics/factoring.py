@@ -26,7 +26,7 @@ TERM_SWEEPS = 20
 
 
 def sparse_operator(index, weight, n):
-    """Sparse matrix of a stencil: row i blends the samples ``index[i]`` with ``weight[i]``; shape (rows, n), float32."""
+    """Sparse matrix of a stencil, float32 (rows, n): row i blends the samples ``index[i]`` with ``weight[i]``."""
     from scipy import sparse
 
     index = np.asarray(index).reshape(len(index), -1)

@@ -104,7 +104,8 @@ class Resampling:
     def _parabolic(self, views, lights, map_size, four):
         """Operators from the factors' samples to the texels of their maps."""
         w = texel_directions(map_size).reshape(-1, 3)
-        above = w + [0, 0, 1e-3]
+        # Just above the horizon, where the weights and the fall to the horizon still have a quotient.
+        above = w + np.array([0, 0, 1e-3])
         above /= np.linalg.norm(above, axis=1, keepdims=True)
         index, weight = lights.stencil(above, hold=False)
         # The part of the fall to the horizon that every evaluation applies is taken out of the map.

@@ -165,6 +165,7 @@ class Representation:
 
     @classmethod
     def from_arrays(cls, arrays, meta):
+        """See the protocol."""
         return cls(arrays, meta)
 
 

@@ -23,7 +23,8 @@ from btfref.representations.lookup import base_meta, direction_arrays, stored
 STORAGES = ("float", "half", "byte")
 
 #: Maps of equal RMS are clustered, whatever they contribute: weighing them by their scales, or normalising peaks as the
-#: paper does, costs the checker, rings and tissue up to 25 % in colour difference. They are clustered in the span of this many principal directions; of 3 · 32² dimensions, hardly more carry anything.
+#: paper does, costs checker, rings and tissue up to a quarter in colour difference. They are clustered in the span of
+#: this many principal directions; of 3 · 32² dimensions, hardly more carry anything.
 CLUSTERING_RANK = 64
 
 #: Beyond this many maps, mini-batches replace whole passes.
@@ -120,7 +121,7 @@ def codebook(maps, clusters, seed):
     if clusters is None or len(maps) <= clusters:
         return np.arange(len(maps)), maps
     rng = np.random.default_rng(seed)
-    points = maps @ range_basis(maps, CLUSTERING_RANK, rng).T
+    _, points = range_basis(maps, CLUSTERING_RANK, rng)
     # Maps of equal texels differ by rounding; k-means wants no more clusters than distinct points.
     distinct, labels = np.unique(np.round(points, 4), axis=0, return_inverse=True)
     if len(distinct) > clusters:

@@ -1,9 +1,10 @@
 """Homomorphic factorization: factors of light, half vector and view from a linear system of their logarithms.
 
-Sources: M. McCool, J. Ang, A. Ahmad, "Homomorphic Factorization of BRDFs for High-Performance Rendering", SIGGRAPH 2001;
-F. Suykens, K. vom Berge, A. Lagae, P. Dutré, "Interactive Rendering with Bidirectional Texture Functions",
-Eurographics 2003, section 4.3: ``log f = P̃(l) + Q̃(h) + R̃(v)``, one row of bilinear weights per sample, with smoothing rows
-``λ L x̃ = 0``. The matrix depends on directions alone, so it is factored once for all texels and channels.
+Sources: M. McCool, J. Ang, A. Ahmad, "Homomorphic Factorization of BRDFs for High-Performance Rendering",
+SIGGRAPH 2001; F. Suykens, K. vom Berge, A. Lagae, P. Dutré, "Interactive Rendering with Bidirectional Texture
+Functions", Eurographics 2003, section 4.3: ``log f = P̃(l) + Q̃(h) + R̃(v)``, one row of bilinear weights per sample,
+with smoothing rows ``λ L x̃ = 0``. The matrix depends on directions alone, so it is factored once for all texels and
+channels.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ class LogSystem:
 
 
 def logarithms(tables, floor):
-    """Logarithms of tables of mean 1 with values below ``floor`` counted as ``floor``; (view, light, m) -> (pairs, m)."""
+    """Logarithms of tables of mean 1, values below ``floor`` counted as ``floor``; (view, light, m) -> (pairs, m)."""
     return np.log(np.maximum(tables, floor)).reshape(-1, tables.shape[-1]).astype(float)
 
 

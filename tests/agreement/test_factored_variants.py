@@ -24,6 +24,7 @@ FORMS = {
 @pytest.mark.parametrize("form", FORMS)
 def test_every_form_agrees(form, llvm, need, tmp_path):
     import drjit as dr
+
     import mitsuba_plugins
     from btfref.render.probe import probe
 

@@ -26,6 +26,9 @@ SETTINGS = {
     "lafortune_lut": {"lobes": 2},
 }
 SETTINGS = {"lpca": {"clusters": 5, "components": 3}, "cmf": {"clusters": 9}, "hf": {"clusters": 9, "smoothness": 1.0}}
+    "cmf": {"clusters": 9},
+    "hf": {"clusters": 9, "smoothness": 1.0},
+}
 
 N_POINTS = 20_000
 

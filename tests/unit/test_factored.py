@@ -284,6 +284,7 @@ def alternating(fitted):
 @pytest.mark.parametrize("storage", ["half", "byte"])
 def test_no_slice_leaks_into_another(storage, llvm, need, rng, tmp_path):
     import drjit as dr
+
     import mitsuba_plugins
     from btfref.render.probe import probe
 
