@@ -11,6 +11,7 @@ import time
 import numpy as np
 
 from btfref.bench.timing import machine
+from btfref.errors import InputError
 
 #: Name → method and parameters. "as published": no refinement, and 8-bit scales where the maps have 8 bits.
 VARIANTS = {
@@ -29,7 +30,7 @@ RELMSE_SHARE = 0.1
 N_PICTURES = 64
 
 
-def run(*, quick=False, progress=None, btf=None):
+def run(*, quick=False, progress=None, btf=None, only=None):
     """Times and errors of the variants.
 
     Parameters
@@ -39,6 +40,8 @@ def run(*, quick=False, progress=None, btf=None):
     progress : callable, optional
     btf : SampledBTF, optional
         Default: a checker of 64² texels at 8 × 8 views and as many lights, 4096 samples a texel as in the paper.
+    only : iterable of str, optional
+        Of "cmf" and "hf".
 
     Returns
     -------
@@ -51,10 +54,13 @@ def run(*, quick=False, progress=None, btf=None):
     from btfref.sampling.synthesis import synthesize
 
     btf = btf or synthesize("checker", texels=64, views="8x8", lights="8x8", spp=2, progress=progress)
+    variants = {name: v for name, v in VARIANTS.items() if not only or v[0] in only}
+    if not variants:
+        raise InputError("nothing to measure", field="--only", got=", ".join(only), expected="cmf or hf")
     rounds = 1 if quick else 3
-    raw, errors = {}, {name: {} for name in VARIANTS}
+    raw, errors = {}, {name: {} for name in variants}
     for turn in range(rounds):
-        for name, (key, parameters) in VARIANTS.items():
+        for name, (key, parameters) in variants.items():
             for label, clusters in (("factorization", None), ("clustered", 256)):
                 for storage in STORAGES:
                     if turn and storage != STORAGES[0]:
@@ -76,9 +82,9 @@ def run(*, quick=False, progress=None, btf=None):
         "suite": "factors",
         "parameters": {"shape": list(btf.values.shape), "rounds": rounds, "attributes": btf.attributes},
         "raw": raw,
-        "rate": {name: n_tables * 60 / median[f"{name}, factorization"] for name in VARIANTS},
+        "rate": {name: n_tables * 60 / median[f"{name}, factorization"] for name in variants},
         "clustering": {
-            name: median[f"{name}, clustered"] - median[f"{name}, factorization"] for name in VARIANTS
+            name: median[f"{name}, clustered"] - median[f"{name}, factorization"] for name in variants
         },
         "errors": errors,
         "machine": machine(),

@@ -141,7 +141,7 @@ def read_info(path):
     views, lights = meta["views"], meta["lights"]
     shape = [views["count"], lights["count"], *meta["texels"], 3]
     maps = {name: {**entry, "bytes": map_bytes(name, **entry, meta=meta)} for name, entry in maps.items()}
-    payload = sum(entry["bytes"] for name, entry in maps.items() if not name.startswith(("view_", "light_")))
+    payload = payload_bytes({name: (entry["shape"], entry["dtype"]) for name, entry in maps.items()}, meta)
     raw = 4 * int(np.prod(shape, dtype=np.int64))
     return {
         "kind": "representation",
@@ -158,6 +158,22 @@ def read_info(path):
         "parent": meta["parent"],
         "versions": meta["versions"],
     }
+
+
+def payload_bytes(maps, meta):
+    """Bytes of the maps alone, without direction tables.
+
+    Parameters
+    ----------
+    maps : dict of str to (shape, dtype name)
+    meta : dict
+        See :func:`map_bytes`.
+    """
+    return sum(
+        map_bytes(name, shape, dtype, meta)
+        for name, (shape, dtype) in maps.items()
+        if not name.startswith(("view_", "light_"))
+    )
 
 
 def map_bytes(name, shape, dtype, meta):
