@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from btfref.representations.factored import FACTORS, index_slots
-from mitsuba_plugins.lookup import read_packets, texel_stencil
+from mitsuba_plugins.lookup import read_packets, texel_stencil, wide
 from mitsuba_plugins.parabolic import ParabolicMaps, bilinear_stencil, half_difference
 
 
@@ -26,16 +26,22 @@ class Evaluator:
             name: ParabolicMaps(tensors[f"factor_{name}"]) for name in FACTORS if f"factor_{name}" in tensors
         }
         self.index, self.index_stride = mi.UInt32(tensors["index"].array), tensors["index"].shape[-1]
-        self.scale, self.half_scale = tensors["scale_map"], tensors.get("half_scale")
+        self.scale = self._readable(tensors["scale_map"])
+        self.half_scale = self._readable(tensors["half_scale"]) if "half_scale" in tensors else None
         self.peak = tensors["scale_peak"].array
 
     @staticmethod
-    def _colour(tensor, at, active):
+    def _readable(tensor):
+        """Values of a map of scales: floats, or words of four codes."""
+        return mi.UInt32(tensor.array) if dr.is_integral_v(tensor.array) else wide(tensor)
+
+    @staticmethod
+    def _colour(values, at, active):
         """Colour ``at`` of a map of scales."""
-        if dr.is_integral_v(tensor.array):
-            word = dr.gather(mi.UInt32, mi.UInt32(tensor.array), at, active)
+        if dr.is_integral_v(values):
+            word = dr.gather(mi.UInt32, values, at, active)
             return mi.Color3f(*(mi.Float((word >> shift) & 255) for shift in (0, 8, 16))) * (1 / 255)
-        return mi.Color3f(*(mi.Float(c) for c in read_packets(tensor.array, at, 4, active)[:3]))
+        return mi.Color3f(*(mi.Float(c) for c in read_packets(values, at, 4, active)[:3]))
 
     def _value(self, texel, stencils, active):
         """B of one texel but for the fall to the horizon."""

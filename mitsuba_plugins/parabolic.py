@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_plugins.lookup import HALF_SCALE, HALF_SHIFT, read_packets, widened
+from mitsuba_plugins.lookup import HALF_SCALE, HALF_SHIFT, read_packets, wide, widened
 
 
 def half_difference(w_light, w_view):
@@ -63,6 +63,8 @@ class ParabolicMaps:
             self.values = dr.reinterpret_array(mi.Float, mi.UInt32(np.ascontiguousarray(words).ravel()))
             dr.eval(self.values)
             self.kind = "words"
+        else:
+            self.values = wide(values)
 
     def lookup(self, slice_index, stencil, active=True):
         """Bilinear lookup in a slice; a Color3f.

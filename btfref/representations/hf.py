@@ -23,7 +23,7 @@ __all__ = ["PRESETS", "Representation", "fit"]
 PRESETS = {"paper": {"rescale": False, "storage": "byte", "scale_storage": "byte"}}
 
 #: Candidates for λ where none is given.
-SMOOTHNESS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
+SMOOTHNESS = (0.3, 1.0, 3.0, 10.0)
 
 #: Texels and share of the samples that judge the candidates.
 N_JUDGED, HELD_OUT = 48, 0.2
