@@ -4,7 +4,7 @@ A table of n × n texels covers (s, t) in [−1, 1]²: ``table[row, column]`` wi
 centres at ``(i + ½) · 2/n − 1``, as an OpenGL texture of s ↦ (s + 1)/2 has them. Lookups are bilinear and clamp to the
 edge. The hemisphere fills the unit disc; texels outside of it hold the value of the nearest point of the horizon, so
 that no lookup of the hemisphere reads anything else. The ports are :mod:`mitsuba_plugins.parabolic` and
-``shaders/lib/parabolic.glsl``.
+``shaders/lib/parabolic_maps.glsl``.
 """
 
 from __future__ import annotations

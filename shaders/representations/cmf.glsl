@@ -6,7 +6,7 @@
 
 #include "lib/directions.glsl"
 #include "lib/halfway.glsl"
-#include "lib/parabolic.glsl"
+#include "lib/parabolic_maps.glsl"
 #include "lib/texels.glsl"
 
 uniform sampler2DArray factor_p;

@@ -24,8 +24,6 @@ SETTINGS = {
     "lpca": {"clusters": 5, "components": 3},
     "lafortune": {"lobes": 2},
     "lafortune_lut": {"lobes": 2},
-}
-SETTINGS = {"lpca": {"clusters": 5, "components": 3}, "cmf": {"clusters": 9}, "hf": {"clusters": 9, "smoothness": 1.0}}
     "cmf": {"clusters": 9},
     "hf": {"clusters": 9, "smoothness": 1.0},
 }
