@@ -160,7 +160,9 @@ def test_maps_are_differentiable(key, paths, llvm, rng):
     loss = mean(t)
     dr.forward(t)
     slope = dr.grad(loss)[0]
-    difference = (mean(mi.Float(0.05))[0] - mean(mi.Float(-0.05))[0]) / 0.1
+    # Richardson's extrapolation of the central difference: some methods are not linear in their maps.
+    wide, narrow = ((mean(mi.Float(h))[0] - mean(mi.Float(-h))[0]) / (2 * h) for h in (0.05, 0.025))
+    difference = (4 * narrow - wide) / 3
     assert abs(difference) > 1e-6  # the map does reach the value
     assert abs(slope - difference) <= tolerance("plugin.gradient.max") * abs(difference)
 
