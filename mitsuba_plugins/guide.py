@@ -191,6 +191,8 @@ class LightGuide:
             keep, rest / dr.maximum(threshold, 1e-20), (rest - threshold) / dr.maximum(1 - threshold, 1e-20)
         )
         radial = (mi.Float(cell // N_AZIMUTH) + dr.clip(x, 0, dr.one_minus_epsilon(mi.Float))) / N_RADIAL
+        # The sum may round up to 1, which is the horizon.
+        radial = dr.minimum(radial, dr.one_minus_epsilon(mi.Float))
         azimuth = (mi.Float(cell % N_AZIMUTH) + sample2.y) * (2 * np.pi / N_AZIMUTH)
         r = dr.sqrt(radial)
         s, c = dr.sincos(azimuth)

@@ -28,6 +28,11 @@ def row(request):
     return method(request.param)
 
 
+#: Methods that interpolate tables at the measured directions, and so reproduce what their fit says they keep; models
+#: of reflectance with parameters of their own have tests of their own.
+TABLES = ("raw", "svd", "lpca")
+
+
 def at_samples(btf, representation):
     """The definition at every texel centre, view and light: the table that it stands for."""
     rows, columns = btf.values.shape[2:4]
@@ -48,9 +53,10 @@ def test_raw_returns_the_samples(btf):
     )
 
 
-def test_fit_error_is_what_the_definition_shows(btf, row):
+@pytest.mark.parametrize("key", TABLES)
+def test_fit_error_is_what_the_definition_shows(btf, key):
     """The error that a fit reports is that of its stored maps, but for their rounding."""
-    representation = row.fit(btf)
+    representation = method(key).fit(btf)
     stated = np.sqrt(representation.meta.get("fit", {}).get("error", 0.0))
     measured = relative_error(at_samples(btf, representation), btf.values)
     assert abs(measured - stated) <= tolerance("fit.stated.max")
@@ -124,7 +130,9 @@ def test_degenerate_data(values, shape, row):
     for array in representation.arrays().values():
         assert np.isfinite(array).all()
     value = at_samples(btf, representation)
-    np.testing.assert_allclose(value, btf.values, atol=tolerance("fit.constant.max"))
+    assert np.isfinite(value).all()
+    if row.key in TABLES:
+        np.testing.assert_allclose(value, btf.values, atol=tolerance("fit.constant.max"))
     group, mean = representation.sampling_tables()
     assert group.shape == shape
     assert np.isfinite(mean).all()
