@@ -15,7 +15,7 @@ from btfref import conventions
 from btfref.errors import InputError
 from btfref.numerics import interpolation
 from btfref.representations.guide import feature_views, texel_groups
-from btfref.representations.lookup import CHUNK
+from btfref.representations.lookup import StoredMaps, evaluate_points
 
 #: Texels fitted at a time: bounds the memory of luminance tables and of normal equations.
 BLOCK = 4096
@@ -53,24 +53,15 @@ def evaluate_analytic(representation, kernel, uv, w_light, w_view):
     """
     meta = representation.meta
     views = interpolation.from_arrays(representation.arrays(), "view")
-    uv, w_light, w_view = (np.asarray(a, float) for a in (uv, w_light, w_view))
-    shape = np.broadcast_shapes(uv.shape[:-1], w_light.shape[:-1], w_view.shape[:-1])
-    uv, w_light, w_view = (
-        np.broadcast_to(a, (*shape, a.shape[-1])).reshape(-1, a.shape[-1]) for a in (uv, w_light, w_view)
-    )
-    result = np.zeros((len(uv), 3))
-    for start in range(0, len(uv), CHUNK):
-        part = slice(start, start + CHUNK)
-        valid = conventions.valid_directions(w_light[part]) & conventions.valid_directions(w_view[part])
-        if not valid.any():
-            continue
-        texel, texel_weight = conventions.texel_stencil(uv[part][valid], meta["texels"], meta["filter_type"])
-        view, view_weight = views.stencil(w_view[part][valid])
-        light, fade = held(w_light[part][valid], meta["constants"]["light_edge"])
-        held_view, _ = held(w_view[part][valid], meta["constants"]["view_edge"])
-        lookups = Lookups(texel, texel_weight, view, view_weight, light, held_view)
-        result[part][valid] = fade[:, None] * kernel(lookups)
-    return result.reshape(*shape, 3)
+
+    def lookup(uv, w_light, w_view):
+        texel, texel_weight = conventions.texel_stencil(uv, meta["texels"], meta["filter_type"])
+        view, view_weight = views.stencil(w_view)
+        light, fade = held(w_light, meta["constants"]["light_edge"])
+        held_view, _ = held(w_view, meta["constants"]["view_edge"])
+        return fade[:, None] * kernel(Lookups(texel, texel_weight, view, view_weight, light, held_view))
+
+    return evaluate_points(lookup, uv, w_light, w_view)
 
 
 def held(w, edge):
@@ -169,27 +160,23 @@ def fit_report(representation, btf):
     return {"average": float(error.mean()), "minimum": float(error.min()), "maximum": float(error.max())}
 
 
-def sampling_tables(representation):
-    """See the protocol; groups by shape, means over a few members of each.
+class AnalyticMaps(StoredMaps):
+    """Maps of a method that has ``luminance_tables(texels, views) -> (n, n_views, n_lights)``."""
 
-    Uses the method's ``luminance_tables(texels, views) -> (n, n_views, n_lights)``.
-    """
-    rows, columns = representation.meta["texels"]
-    n_views = len(representation.arrays()["view_directions"])
-    some = feature_views(n_views)
-    features = [
-        representation.luminance_tables(np.arange(first, min(first + BLOCK, rows * columns)), some)
-        for first in range(0, rows * columns, BLOCK)
-    ]
-    labels = texel_groups(np.concatenate(features).reshape(rows * columns, -1))
-    means = []
-    for group in range(int(labels.max()) + 1):
-        members = np.flatnonzero(labels == group)
-        members = members[
-            np.linspace(0, len(members) - 1, min(len(members), GUIDE_MEMBERS)).round().astype(int)
+    def sampling_tables(self):
+        """Groups of texels alike, and means over a few members of each."""
+        rows, columns = self.meta["texels"]
+        n_views, n_lights = (len(self.maps[f"{kind}_directions"]) for kind in ("view", "light"))
+        some = feature_views(n_views)
+        features = [
+            self.luminance_tables(np.arange(first, min(first + BLOCK, rows * columns)), some)
+            for first in range(0, rows * columns, BLOCK)
         ]
-        if len(members):
-            means.append(representation.luminance_tables(members, np.arange(n_views)).mean(0))
-        else:
-            means.append(np.zeros((n_views, len(representation.arrays()["light_directions"])), np.float32))
-    return labels.reshape(rows, columns), np.stack(means)
+        labels = texel_groups(np.concatenate(features).reshape(rows * columns, -1))
+        means = np.zeros((int(labels.max()) + 1, n_views, n_lights), np.float32)
+        for group in range(len(means)):
+            members = np.flatnonzero(labels == group)
+            spread = np.linspace(0, len(members) - 1, min(len(members), GUIDE_MEMBERS)).round().astype(int)
+            if len(members):
+                means[group] = self.luminance_tables(members[spread], np.arange(n_views)).mean(0)
+        return labels.reshape(rows, columns), means

@@ -302,12 +302,7 @@ def fit(
         btf,
         maps,
         parameters,
-        clusters=clusters,
-        storage=storage,
-        scale_storage=scale_storage,
-        rescale=rescale,
         exponent=exponent,
-        seed=seed,
         filter_type=filter_type,
         report=lambda label: report(next(labels), steps, label),
     )

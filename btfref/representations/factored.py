@@ -10,15 +10,13 @@ peak of 1; the scale is fitted again to the stored maps.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from btfref import conventions
 from btfref.numerics.halfway import half_difference
 from btfref.numerics.parabolic import bilinear_stencil
 from btfref.representations.guide import N_GROUPS, feature_views, group_means, texel_groups
-from btfref.representations.lookup import evaluate_points, packed_arrays
+from btfref.representations.lookup import StoredMaps, evaluate_points
 
 #: Factors in the order of the index map's channels; with one term each and no D these are the paper's r, g and b.
 FACTORS = ("p", "q", "r", "d")
@@ -27,8 +25,7 @@ FACTORS = ("p", "q", "r", "d")
 GUIDE_MEMBERS = 16
 
 
-@dataclass(frozen=True)
-class Representation:
+class Representation(StoredMaps):
     """Codebooks and index maps.
 
     ``factor_p``, ``factor_q``, ``factor_r`` and, in the four-factor form, ``factor_d`` [prototype, n, n, 3];
@@ -36,9 +33,6 @@ class Representation:
     [row, column, term, 3] in [0, 1] times ``scale_peak`` [term, 3]; ``half_scale`` [row, column, term, 3] with more
     than one term of Q · D. uint8 maps hold 255 times their value.
     """
-
-    maps: dict
-    meta: dict
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored.
@@ -123,14 +117,6 @@ class Representation:
         product = operators.product(self.factors(texels))
         return product.reshape(*operators.shape, -1, 3)
 
-    def arrays(self):
-        """Codebooks, index and scales, and the direction tables."""
-        return self.maps
-
-    def port_arrays(self):
-        """The same maps with channels padded to four."""
-        return packed_arrays(self.maps)
-
     def sampling_tables(self):
         """Groups of texels alike, and the means of some of their members."""
         from btfref.representations.factored_fit import map_operators
@@ -162,11 +148,6 @@ class Representation:
             ]
         )
         return labels.reshape(self.meta["texels"]), group_means(labels[members], tables)
-
-    @classmethod
-    def from_arrays(cls, arrays, meta):
-        """See the protocol."""
-        return cls(arrays, meta)
 
 
 def index_slots(constants):

@@ -143,41 +143,22 @@ def stored_maps(name, maps, storage):
     return stored(name, maps, storage)
 
 
-def assemble(
-    key,
-    btf,
-    maps,
-    parameters,
-    *,
-    clusters,
-    storage,
-    scale_storage,
-    rescale,
-    exponent,
-    seed,
-    filter_type,
-    report,
-):
+def assemble(method, btf, maps, parameters, *, exponent, filter_type, report):
     """Normalise, cluster and store factors.
 
     Parameters
     ----------
-    key : str
-        Method.
+    method : str
     btf : SampledBTF
     maps : dict of str to ndarray of float32, shape (texel, term, n, n, 3)
         "p", "q", "r" and perhaps "d"; overwritten.
     parameters : dict
-        For the file.
-    clusters : int or None
-        Prototypes of each factor.
-    storage : {"float", "half", "byte"}
-    scale_storage : {"float", "half", "byte"} or None
-        Of the scale map; None: that of the maps, but half for "byte".
-    rescale : bool
-        Fit the scales to the data again, by weighted least squares, with the stored maps in place.
+        Of the fit, for the file. Here count ``clusters`` (prototypes of each factor, or None), ``storage`` and
+        ``scale_storage`` ("float", "half" or "byte"; None: that of the maps, but half for "byte"), ``rescale`` (fit
+        the scales to the data again, by weighted least squares, with the stored maps in place) and ``seed``.
     exponent : float
         Of the weights; see :func:`btfref.numerics.factoring.sample_weights`.
+    filter_type : {"bilinear", "nearest"}
     report : callable
         ``report(label)``.
 
@@ -186,6 +167,7 @@ def assemble(
     Representation
         ``meta["fit"]`` holds the relative squared error ("error") and that before the scales were fitted again.
     """
+    storage, scale_storage = parameters["storage"], parameters["scale_storage"]
     # Maps are clustered at equal RMS, not at equal peaks: a peak is one texel, and prototypes get their own below.
     size = {name: np.sqrt(np.square(m, dtype=float).mean((2, 3))) for name, m in maps.items()}
     half_scale = size["q"] * size.get("d", 1)
@@ -196,7 +178,7 @@ def assemble(
         report(f"clustering {name}")
         m = maps.pop(name)
         m /= np.maximum(size[name], TINY)[:, :, None, None]
-        labels, prototypes = codebook(m.reshape(-1, n * n * 3), clusters, seed)
+        labels, prototypes = codebook(m.reshape(-1, n * n * 3), parameters["clusters"], parameters["seed"])
         prototypes = prototypes.reshape(-1, n, n, 3)
         peak = prototypes.max((1, 2))
         prototypes /= np.maximum(peak, TINY)[:, None, None]
@@ -213,7 +195,7 @@ def assemble(
     arrays["index"] = index.reshape(rows, columns, -1)
     if half_scale.shape[1] > 1:
         arrays["half_scale"] = stored_maps("half_scale", half_scale, storage).reshape(rows, columns, -1, 3)
-    meta = base_meta(key, btf, parameters, filter_type=filter_type)
+    meta = base_meta(method, btf, parameters, filter_type=filter_type)
     meta["constants"] = {
         "n_terms": scale.shape[1],
         "n_half_terms": half_scale.shape[1],
@@ -223,7 +205,7 @@ def assemble(
     report("scales")
     moments, weighted = _moments(btf, arrays, meta["constants"], half_scale, exponent)
     error = _error(moments, scale)
-    if rescale:
+    if parameters["rescale"]:
         scale = _fitted_scale(weighted, scale)
     limit = scale.max(0)
     limit = np.where(limit > 0, limit, 1).astype(np.float32)

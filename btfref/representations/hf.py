@@ -235,12 +235,7 @@ def fit(
         btf,
         maps,
         parameters,
-        clusters=clusters,
-        storage=storage,
-        scale_storage=scale_storage,
-        rescale=rescale,
         exponent=EXPONENT,
-        seed=seed,
         filter_type=filter_type,
         report=lambda label: report(next(labels), steps, label),
     )

@@ -11,15 +11,13 @@ A lobe is stored as coefficients in [−1, 1], exponent and peak, instead of as 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from btfref.numerics.levenberg import BatchFit, fit_batch
 from btfref.numerics.powers import FLOOR, safe_power
 from btfref.representations import analytic
 from btfref.representations.lobe_start import exponent_limit
-from btfref.representations.lookup import base_meta, direction_arrays, packed_arrays, positive_integer, stored
+from btfref.representations.lookup import base_meta, direction_arrays, positive_integer, stored
 
 #: "paper": Table 1's four lobes, in floats.
 PRESETS = {"paper": {"lobes": 4, "storage": "float"}}
@@ -36,14 +34,10 @@ STARTS = (
 )
 
 
-@dataclass(frozen=True)
-class Representation:
+class Representation(analytic.AnalyticMaps):
     """``lobes`` [row, column, 4 k]: coefficients and exponent of each lobe; ``peaks`` [row, column, k];
     ``colour`` [row, column, 4]: chroma and ρ_d in 1/sr; and the direction tables.
     """  # noqa: D205
-
-    maps: dict
-    meta: dict
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored. Never negative."""
@@ -58,23 +52,6 @@ class Representation:
     def luminance_tables(self, texels, views):
         """Model of luminance at measured views and all measured lights, shape (n, n_views, n_lights)."""
         return luminance_tables(self.maps, texels, views)
-
-    def arrays(self):
-        """``lobes``, ``peaks``, ``colour`` and the direction tables."""
-        return self.maps
-
-    def port_arrays(self):
-        """As stored: a lobe is one texel."""
-        return packed_arrays(self.maps)
-
-    def sampling_tables(self):
-        """Groups of texels alike, and their means."""
-        return analytic.sampling_tables(self)
-
-    @classmethod
-    def from_arrays(cls, arrays, meta):
-        """The representation of these maps."""
-        return cls(arrays, meta)
 
 
 def flat_maps(maps):

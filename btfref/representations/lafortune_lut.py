@@ -7,12 +7,10 @@ shows of itself to a view (self-occlusion); Meseth, Müller, Klein 2004, Table 1
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from btfref.representations import analytic, lafortune
-from btfref.representations.lookup import packed_arrays, positive_integer
+from btfref.representations.lookup import positive_integer
 
 #: "paper": Table 1's four lobes, in floats.
 PRESETS = {"paper": {"lobes": 4, "storage": "float"}}
@@ -21,12 +19,8 @@ PRESETS = {"paper": {"lobes": 4, "storage": "float"}}
 FACTOR_BOUND = 8.0
 
 
-@dataclass(frozen=True)
-class Representation:
+class Representation(analytic.AnalyticMaps):
     """Maps of :class:`btfref.representations.lafortune.Representation` and ``factor`` [row, column, view]."""
-
-    maps: dict
-    meta: dict
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored. Never negative.
@@ -48,23 +42,6 @@ class Representation:
         """Model of luminance at measured views and all measured lights, shape (n, n_views, n_lights)."""
         factor = self.maps["factor"].reshape(-1, self.maps["factor"].shape[-1])[texels[:, None], views]
         return factor[..., None].astype(np.float32) * lafortune.luminance_tables(self.maps, texels, views)
-
-    def arrays(self):
-        """``lobes``, ``peaks``, ``colour``, ``factor`` and the direction tables."""
-        return self.maps
-
-    def port_arrays(self):
-        """As stored: a lobe is one texel; the factors of a texel are contiguous."""
-        return packed_arrays(self.maps)
-
-    def sampling_tables(self):
-        """Groups of texels alike, and their means."""
-        return analytic.sampling_tables(self)
-
-    @classmethod
-    def from_arrays(cls, arrays, meta):
-        """The representation of these maps."""
-        return cls(arrays, meta)
 
 
 def fit(btf, *, seed=0, progress=None, lobes=4, rounds=1, storage="half", filter_type="bilinear"):

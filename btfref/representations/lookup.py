@@ -31,6 +31,30 @@ class Stencils:
         return self.view_weight[:, :, None] * self.light_weight[:, None, :]
 
 
+@dataclass(frozen=True)
+class StoredMaps:
+    """The part of a representation that does not depend on the method: its maps, its meta, and their way to files.
+
+    A convenience: :class:`btfref.representations.protocol.Representation` asks for the methods, not for this class.
+    """
+
+    maps: dict
+    meta: dict
+
+    def arrays(self):
+        """All maps and the direction tables, as they are stored."""
+        return self.maps
+
+    def port_arrays(self):
+        """The same with channels padded to four."""
+        return packed_arrays(self.maps)
+
+    @classmethod
+    def from_arrays(cls, arrays, meta):
+        """The representation whose :meth:`arrays` and ``meta`` these are."""
+        return cls(arrays, meta)
+
+
 def evaluate_tabulated(representation, kernel, uv, w_light, w_view):
     """Evaluate a method that interpolates tables over measured directions and texels.
 

@@ -8,8 +8,6 @@ VMV 2003; the same authors, "Fast Environmental Lighting for Local-PCA Encoded B
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from btfref import conventions
@@ -18,6 +16,7 @@ from btfref.numerics.lowrank import range_basis, refined_basis, texel_matrix
 from btfref.numerics.threads import one_blas_thread
 from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
+    StoredMaps,
     base_meta,
     direction_arrays,
     evaluate_tabulated,
@@ -37,16 +36,12 @@ SUBSPACE_RANK = 64
 OVERSAMPLING = 4
 
 
-@dataclass(frozen=True)
-class Representation:
+class Representation(StoredMaps):
     """Maps of a local PCA.
 
     ``basis`` [cluster, 1 + component, view, light, 3] with the cluster's mean first, ``weights``
     [row, column, component], ``cluster`` [row, column, 1] uint32, and the direction tables.
     """
-
-    maps: dict
-    meta: dict
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored.
@@ -71,10 +66,6 @@ class Representation:
 
         return evaluate_tabulated(self, kernel, uv, w_light, w_view)
 
-    def arrays(self):
-        """``basis``, ``weights``, ``cluster`` and the direction tables."""
-        return self.maps
-
     def port_arrays(self):
         """``basis`` [cluster, view, light, (1 + component) · 3]: one direction pair of one cluster is contiguous."""
         basis = np.moveaxis(self.maps["basis"], 1, 3)
@@ -95,11 +86,6 @@ class Representation:
         labels = texel_groups(coefficient.reshape(len(cluster), -1) @ some)
         mean = np.tensordot(group_means(labels, coefficient), basis, 2)
         return labels.reshape(self.maps["cluster"].shape[:2]), mean
-
-    @classmethod
-    def from_arrays(cls, arrays, meta):
-        """See :meth:`btfref.representations.protocol.Representation.from_arrays`."""
-        return cls(arrays, meta)
 
 
 def fit(btf, *, seed=0, progress=None, clusters=16, components=4, storage="half", filter_type="bilinear"):

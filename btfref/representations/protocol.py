@@ -1,4 +1,4 @@
-"""What a representation is: frozen dataclasses satisfy it; there is no base class."""
+"""What a representation is: anything with these methods satisfies it; there is no base class to derive from."""
 
 from __future__ import annotations
 

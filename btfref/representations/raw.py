@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from btfref import conventions
 from btfref.representations.guide import feature_views, group_means, texel_groups
-from btfref.representations.lookup import base_meta, direction_arrays, evaluate_tabulated, packed_arrays
+from btfref.representations.lookup import StoredMaps, base_meta, direction_arrays, evaluate_tabulated
 
 PRESETS = {"paper": {}}
 
 
-@dataclass(frozen=True)
-class Representation:
+class Representation(StoredMaps):
     """Table ``values`` [row, column, view, light, 3] and the directions it is sampled at."""
-
-    maps: dict
-    meta: dict
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored."""
@@ -37,14 +31,6 @@ class Representation:
 
         return evaluate_tabulated(self, kernel, uv, w_light, w_view)
 
-    def arrays(self):
-        """``values`` and the direction tables."""
-        return self.maps
-
-    def port_arrays(self):
-        """``values`` [row, column, view, light, 4]."""
-        return packed_arrays(self.maps)
-
     def sampling_tables(self):
         """Groups of texels alike, and their means."""
         values = self.maps["values"]
@@ -52,11 +38,6 @@ class Representation:
         some = conventions.luminance(table[:, feature_views(table.shape[1])].astype(np.float32))
         labels = texel_groups(some.reshape(len(table), -1))
         return labels.reshape(values.shape[:2]), conventions.luminance(group_means(labels, table))
-
-    @classmethod
-    def from_arrays(cls, arrays, meta):
-        """See :meth:`btfref.representations.protocol.Representation.from_arrays`."""
-        return cls(arrays, meta)
 
 
 def fit(btf, *, seed=0, progress=None, filter_type="bilinear"):

@@ -12,15 +12,13 @@ to a power.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from btfref.numerics.levenberg import fit_batch
 from btfref.numerics.powers import FLOOR, safe_power, unit_lobe
 from btfref.representations import analytic
 from btfref.representations.lobe_start import exponent_limit, lobe_starts
-from btfref.representations.lookup import base_meta, direction_arrays, packed_arrays, positive_integer, stored
+from btfref.representations.lookup import base_meta, direction_arrays, positive_integer, stored
 
 #: "paper": two lobes in floats.
 PRESETS = {"paper": {"lobes": 2, "storage": "float"}}
@@ -44,14 +42,10 @@ SECOND_CHANCE = 0.15
 DIFFUSE_QUANTILE = 0.1
 
 
-@dataclass(frozen=True)
-class Representation:
+class Representation(analytic.AnalyticMaps):
     """``lobes`` [row, column, view, 4 k]: parabolic axis (s, t), exponent, peak of each; ``colour`` [row, column, 4]:
     chroma and diffuse albedo ρ_d in 1/sr; and the direction tables.
     """  # noqa: D205
-
-    maps: dict
-    meta: dict
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored. Never negative."""
@@ -84,23 +78,6 @@ class Representation:
             power = safe_power(np.minimum(axis[:, :, j] @ lights.T, 1), exponent[:, :, j, None])
             result = result + peak[:, :, j, None] * power
         return result
-
-    def arrays(self):
-        """``lobes``, ``colour`` and the direction tables."""
-        return self.maps
-
-    def port_arrays(self):
-        """As stored: a lobe is one texel."""
-        return packed_arrays(self.maps)
-
-    def sampling_tables(self):
-        """Groups of texels alike, and their means."""
-        return analytic.sampling_tables(self)
-
-    @classmethod
-    def from_arrays(cls, arrays, meta):
-        """The representation of these maps."""
-        return cls(arrays, meta)
 
 
 def parabolic_axis(s, t):

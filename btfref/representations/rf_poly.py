@@ -11,12 +11,10 @@ l_z²``, so the functions are the same, but at grazing light, where they are sma
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from btfref.representations import analytic
-from btfref.representations.lookup import base_meta, direction_arrays, packed_arrays, stored
+from btfref.representations.lookup import base_meta, direction_arrays, stored
 
 #: "paper": all 81 views in floats.
 PRESETS = {"paper": {"storage": "float"}}
@@ -32,12 +30,8 @@ def terms(w_light):
     return np.stack([x * x, y * y, x * y, x, y, z * z], -1)
 
 
-@dataclass(frozen=True)
-class Representation:
+class Representation(analytic.AnalyticMaps):
     """``polynomial`` [row, column, view, 6], ``chroma`` [row, column, 3], and the direction tables."""
-
-    maps: dict
-    meta: dict
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored.
@@ -61,23 +55,6 @@ class Representation:
         polynomial = self.maps["polynomial"]
         coefficient = polynomial.reshape(-1, *polynomial.shape[2:])[texels[:, None], views].astype(np.float32)
         return coefficient @ terms(self.maps["light_directions"].astype(np.float32)).T
-
-    def arrays(self):
-        """``polynomial``, ``chroma`` and the direction tables."""
-        return self.maps
-
-    def port_arrays(self):
-        """As stored; the six coefficients fill two texels."""
-        return packed_arrays(self.maps)
-
-    def sampling_tables(self):
-        """Groups of texels alike, and their means."""
-        return analytic.sampling_tables(self)
-
-    @classmethod
-    def from_arrays(cls, arrays, meta):
-        """The representation of these maps."""
-        return cls(arrays, meta)
 
 
 def light_operator(lights):

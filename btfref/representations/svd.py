@@ -6,14 +6,13 @@ Texture Functions", Texture 2003. ``B_x = Σ_c w_{x,c} E_c``, without a mean.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from btfref import conventions
 from btfref.numerics.lowrank import range_basis, texel_matrix
 from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
+    StoredMaps,
     base_meta,
     direction_arrays,
     evaluate_tabulated,
@@ -26,12 +25,8 @@ from btfref.representations.lookup import (
 PRESETS = {"paper": {"components": 150, "storage": "float"}}
 
 
-@dataclass(frozen=True)
-class Representation:
+class Representation(StoredMaps):
     """Maps: ``basis`` [component, view, light, 3], ``weights`` [row, column, component], direction tables."""
-
-    maps: dict
-    meta: dict
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored.
@@ -49,10 +44,6 @@ class Representation:
 
         return evaluate_tabulated(self, kernel, uv, w_light, w_view)
 
-    def arrays(self):
-        """``basis``, ``weights`` and the direction tables."""
-        return self.maps
-
     def port_arrays(self):
         """``basis`` [view, light, component · 3]: one direction pair is contiguous."""
         basis = np.moveaxis(self.maps["basis"], 0, 2)
@@ -66,11 +57,6 @@ class Representation:
         some = np.tensordot(flat, basis[:, feature_views(basis.shape[1])], 1)
         labels = texel_groups(some.reshape(len(flat), -1))
         return labels.reshape(weights.shape[:2]), np.tensordot(group_means(labels, flat), basis, 1)
-
-    @classmethod
-    def from_arrays(cls, arrays, meta):
-        """See :meth:`btfref.representations.protocol.Representation.from_arrays`."""
-        return cls(arrays, meta)
 
 
 def fit(btf, *, seed=0, progress=None, components=16, storage="half", filter_type="bilinear"):
