@@ -1,7 +1,5 @@
 """Real-time images against noise-free references: gates that pass, and gates that catch injected faults."""
 
-from importlib.resources import files
-
 import numpy as np
 import pytest
 from oracle import oracle_btf
@@ -9,8 +7,6 @@ from oracle import oracle_btf
 from btfref import registry, representations
 from btfref.compare import compare
 from btfref.errors import InputError
-from btfref.platform import shader_directory
-from btfref.render import gl
 from btfref.render.classes import pixel_classes
 from btfref.render.realtime import realtime
 from btfref.render.reference import render
@@ -32,78 +28,6 @@ def save_fitted(directory, key, **settings):
     path = directory / f"oracle.{key}.exr"
     representations.save(rep, path)
     return str(path)
-
-
-@pytest.fixture(scope="module")
-def lpca(tmp_path_factory):
-    return save_fitted(tmp_path_factory.mktemp("lpca"), "lpca", clusters=8, components=4)
-
-
-@pytest.fixture(scope="module")
-def reference(lpca):
-    """``reference(scene, lights) -> (parameters, image, classes)`` of a shipped scene, rendered once."""
-    made = {}
-
-    def get(name, lights):
-        if (name, lights) not in made:
-            path = files("btfref.scenes").joinpath(f"{name}.xml")
-            parameters = {"btf": lpca, "lights": lights, "tiling": "4"}
-            image = render(path, parameters=parameters, noise_free=GRID, shadows=False, size=SIZE)
-            classes = pixel_classes(path, parameters=parameters, grid=GRID, size=SIZE)
-            made[name, lights] = path, parameters, image, classes
-        return made[name, lights]
-
-    return get
-
-
-@pytest.mark.parametrize("lights", ["directional1", "directional3", "points2"])
-@pytest.mark.parametrize("name", ["plane", "sphere", "cloth"])
-def test_shipped_scenes(reference, name, lights):
-    path, parameters, expected, classes = reference(name, lights)
-    image = realtime(path, parameters=parameters, grid=GRID, size=SIZE)
-    comparison = compare(image, expected, classes=classes, gate=GATES, flip=False)
-    assert comparison.passed, [gate.line for gate in comparison.gates if not gate.passed]
-    # The scene fills the picture and is lit: the gates saw something.
-    assert (classes == 1).mean() > 0.2
-    assert (expected.image[classes == 1].max(-1) > 0).mean() > 0.5
-    assert image.meta["not_finite"] == 0
-
-
-FAULTS = {
-    "cosine dropped": ("hosts/mesh.frag", "irradiance * btf", "irradiance / max(w_light.z, 1e-4) * btf"),
-    "light and view swapped": (
-        "hosts/mesh.frag",
-        "btf_eval(uv, w_light, w_view",
-        "btf_eval(uv, w_view, w_light",
-    ),
-    "v flipped": ("hosts/mesh.frag", "btf_eval(uv,", "btf_eval(vec2(uv.x, -uv.y),"),
-    "half-texel shift": ("lib/texels.glsl", "float(columns), 0.5)", "float(columns), 0.0)"),
-    "wrong gamma": ("hosts/mesh.frag", "vec4(scale * sum, 1.0)", "vec4(pow(max(sum, 0.0), vec3(2.2)), 1.0)"),
-    "tangent frame transposed": ("lib/frame.glsl", "return transpose(mat3(", "return (mat3("),
-}
-
-
-@pytest.mark.parametrize("name", FAULTS)
-def test_injected_faults_are_caught_by_the_noise_free_gate(reference, tmp_path, monkeypatch, name):
-    file, right, wrong = FAULTS[name]
-    text = (shader_directory() / file).read_text()
-    assert text.count(right) == 1
-    (tmp_path / file).parent.mkdir(parents=True)
-    (tmp_path / file).write_text(text.replace(right, wrong))
-    shipped = gl.shader_file
-
-    def faulty(rep):
-        shader, directories = shipped(rep)
-        return shader, [tmp_path, *directories]
-
-    monkeypatch.setattr(gl, "shader_file", faulty)
-    path, parameters, expected, classes = reference("cloth", "directional3")
-    image = realtime(path, parameters=parameters, grid=GRID, size=SIZE)
-    comparison = compare(image, expected, classes=classes, gate="image.noise_free", flip=False)
-    failed = {gate.name for gate in comparison.gates if not gate.passed}
-    assert "image.noise_free.p999" in failed
-    # The fault is in what is shown, not in what is seen: the image stays finite.
-    assert "image.finite.nonfinite" not in failed
 
 
 def room(mi, *, shapes, lights, size=SIZE, **more):
