@@ -92,6 +92,15 @@ def ranges(text):
     return tuple(found)
 
 
+def numbers_or_file(text):
+    """Numbers such as ``0.5`` or ``0.5,0.2,0.1`` (a float, a tuple), else the text itself, for argparse."""
+    try:
+        found = tuple(float(item) for item in text.split(","))
+    except ValueError:
+        return text
+    return found[0] if len(found) == 1 else found
+
+
 def direction_set(text):
     """A direction set by name, or from a text file with one ``theta phi`` pair in degrees per line.
 

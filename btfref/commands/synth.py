@@ -13,15 +13,24 @@ from btfref.commands._shared import (
     direction_set,
     emit,
     emit_json,
+    numbers_or_file,
     output_file,
     ranges,
 )
 from btfref.errors import InputError
 
+#: Options that are parameters of a user's mesh or height map.
+_OWN = ("bsdf", "albedo", "roughness", "amplitude", "tile", "up", "allow_seams")
+
 
 def add_arguments(parser):
     """Describe the command's arguments."""
-    parser.add_argument("mesostructure", metavar="MESO", help="name of the mesostructure, e.g. checker")
+    parser.add_argument(
+        "mesostructure",
+        metavar="MESO",
+        help="name of a mesostructure (checker, rings, tissue, flat), a mesh (PLY, OBJ, GLB, STL, OFF) or a "
+        "height map (PNG of 8 or 16 bits, OpenEXR)",
+    )
     parser.add_argument("-o", "--output", required=True, metavar="OUT.btf.zarr", help="the store to write")
     parser.add_argument(
         "--texels", type=count(1), default=64, metavar="N", help="texels per side (default 64)"
@@ -48,6 +57,27 @@ def add_arguments(parser):
         default="path",
         help="path: the reference; surface: visibility traced once for all views and lights (default path)",
     )
+    own = parser.add_argument_group("a mesh or a height map of your own")
+    own.add_argument("--bsdf", metavar="FILE.xml", help="a Mitsuba BSDF, with its textures")
+    own.add_argument(
+        "--albedo", type=numbers_or_file, metavar="IMAGE|R,G,B", help="of a height map (default 0.5,0.5,0.5)"
+    )
+    own.add_argument(
+        "--roughness", type=numbers_or_file, metavar="IMAGE|X", help="of a height map (default: Lambertian)"
+    )
+    own.add_argument(
+        "--amplitude", type=float, metavar="A", help="tile units that a height of 1 stands for (default 0.1)"
+    )
+    own.add_argument(
+        "--tile",
+        type=numbers_or_file,
+        metavar="X0,Y0,X1,Y1",
+        help="where one tile lies in the mesh, in its units, or: bounds (default 0,0,1,1)",
+    )
+    own.add_argument(
+        "--up", choices=("y", "z"), help="axis of the mesh that points up (default: glTF y, else z)"
+    )
+    own.add_argument("--allow-seams", action="store_true", default=None, help="take input that does not tile")
     for name in ("views", "lights", "tiles"):
         parser.add_argument(
             f"--only-{name}", type=ranges, metavar="I,J-K", help=f"fill these {name} now, the rest later"
@@ -60,6 +90,9 @@ def run(args):
     """Carry the command out."""
     out = output_file(args.output, ".btf.zarr")
     parameters = assignments(args.set)
+    for name in _OWN:
+        if getattr(args, name) is not None:
+            parameters[name] = getattr(args, name)
     settings = {
         "texels": args.texels,
         "views": direction_set(args.views),

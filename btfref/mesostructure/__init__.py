@@ -12,6 +12,7 @@ from __future__ import annotations
 import importlib
 import inspect
 from importlib.metadata import entry_points
+from pathlib import Path
 
 from btfref.errors import InputError
 from btfref.mesostructure.base import Mesostructure, Part
@@ -22,8 +23,16 @@ __all__ = ["MESOSTRUCTURES", "Mesostructure", "Part", "build", "names"]
 MESOSTRUCTURES = {
     "checker": "btfref.mesostructure.checker:checker",
     "flat": "btfref.mesostructure.flat:flat",
+    "height_map": "btfref.mesostructure.height_map:height_map",
+    "mesh": "btfref.mesostructure.mesh:mesh",
     "rings": "btfref.mesostructure.rings:rings",
     "tissue": "btfref.mesostructure.tissue:tissue",
+}
+
+#: Mesostructures made from a user's file: name -> suffixes. A file's name stands for them.
+FROM_FILES = {
+    "height_map": (".png", ".exr"),
+    "mesh": (".ply", ".obj", ".glb", ".gltf", ".stl", ".off"),
 }
 
 ENTRY_POINT_GROUP = "btfref.mesostructures"
@@ -59,8 +68,9 @@ def build(mesostructure, **parameters):
 
     Parameters
     ----------
-    mesostructure : str or Mesostructure
-        A registered name; a `Mesostructure` is handed through (and takes no parameters).
+    mesostructure : str, path-like or Mesostructure
+        A registered name, or a user's file: PNG and OpenEXR are height maps, PLY, OBJ, GLB and others meshes.
+        A `Mesostructure` is handed through (and takes no parameters).
     **parameters
         Parameters of that mesostructure, e.g. ``amplitude`` in tile units.
 
@@ -81,6 +91,11 @@ def build(mesostructure, **parameters):
                 expected="none",
             )
         return mesostructure
+    suffix = Path(str(mesostructure)).suffix.lower()
+    for name, suffixes in FROM_FILES.items():
+        if suffix in suffixes:
+            parameters = {"file": str(mesostructure), **parameters}
+            mesostructure = name
     builder = _builder(mesostructure)
     known = inspect.signature(builder).parameters
     for key in parameters:
@@ -90,6 +105,9 @@ def build(mesostructure, **parameters):
                 field=key,
                 expected=f"one of {', '.join(known)}",
             )
+    for key, parameter in known.items():
+        if parameter.default is parameter.empty and key not in parameters:
+            raise InputError(f"mesostructure '{mesostructure}' needs a parameter", field=key)
     try:
         return builder(**parameters)
     except InputError:

@@ -24,11 +24,13 @@ class Part:
     faces : ndarray (F, 3) uint32
         Counter-clockwise seen from outside (from above for a height field).
     bsdf : dict
-        A Mitsuba BSDF as for ``mi.load_dict``, made of plain JSON types.
+        A Mitsuba BSDF as for ``mi.load_dict``, made of plain JSON types; `materials.load_bsdf` makes it.
     normals : ndarray (V, 3) float64 or None
         Unit shading normals; None shades the facets.
     uv : ndarray (V, 2) float64 or None
-        Texture coordinates; None takes x and y.
+        Texture coordinates as Mitsuba has them (v = 0 is an image's first row); None takes x and y.
+    textures : dict of str to ndarray
+        Images that the BSDF refers to by ``{"type": "bitmap", "array": NAME}``.
     """
 
     vertices: np.ndarray
@@ -36,6 +38,7 @@ class Part:
     bsdf: dict
     normals: np.ndarray | None = None
     uv: np.ndarray | None = None
+    textures: dict = field(default_factory=dict, repr=False)
 
     def __post_init__(self):
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)

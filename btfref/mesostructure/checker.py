@@ -10,6 +10,7 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.mesostructure.base import Mesostructure, Part
+from btfref.mesostructure.checks import grid_faces
 
 
 def checker_height(x, y, *, cells, amplitude, smoothness):
@@ -132,12 +133,7 @@ def checker(
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
 
     row, column = (index.ravel() for index in np.mgrid[0:n, 0:n])
-    corner = row * (n + 1) + column
-    # Alternating diagonals: a fixed diagonal would give the slopes a handedness.
-    turned = ((row + column) % 2 == 1)[:, None]
-    quad = np.stack([corner, corner + 1, corner + n + 2, corner + n + 1], axis=1)
-    first = np.where(turned, quad[:, [0, 1, 3]], quad[:, [0, 1, 2]])
-    second = np.where(turned, quad[:, [1, 2, 3]], quad[:, [0, 2, 3]])
+    first, second = grid_faces(n, n)
     # Material borders are grid lines, so a quad's centre says which square all of it belongs to.
     raised = (column * cells // n + row * cells // n) % 2 == 0
 

@@ -83,3 +83,27 @@ def sweep_faces(n_along, n_around):
     here, beside = along * n_around + around, along * n_around + (around + 1) % n_around
     ahead, across = here + n_around, beside + n_around
     return np.concatenate([np.stack([here, ahead, across], 1), np.stack([here, across, beside], 1)])
+
+
+def grid_faces(rows, columns):
+    """Triangles of a grid of quads whose vertices are numbered ``row · (columns + 1) + column``.
+
+    The diagonals alternate: a fixed one would give slopes a handedness.
+
+    Parameters
+    ----------
+    rows, columns : int
+        Quads.
+
+    Returns
+    -------
+    first, second : ndarray, shape (rows · columns, 3), int64
+        Two triangles of each quad, counter-clockwise where rows go along y and columns along x.
+    """
+    row, column = (index.ravel() for index in np.mgrid[0:rows, 0:columns])
+    corner = row * (columns + 1) + column
+    turned = ((row + column) % 2 == 1)[:, None]
+    quad = np.stack([corner, corner + 1, corner + columns + 2, corner + columns + 1], axis=1)
+    first = np.where(turned, quad[:, [0, 1, 3]], quad[:, [0, 1, 2]])
+    second = np.where(turned, quad[:, [1, 2, 3]], quad[:, [0, 2, 3]])
+    return first, second

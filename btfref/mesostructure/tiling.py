@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from btfref.mesostructure.materials import load_bsdf
+
 
 def tile_group(mesostructure, bsdfs=None):
     """One tile as a Mitsuba shape group; set a JIT variant first.
@@ -24,7 +26,7 @@ def tile_group(mesostructure, bsdfs=None):
     group = {"type": "shapegroup"}
     for index, part in enumerate(mesostructure.parts):
         properties = mi.Properties()
-        properties["mesh_bsdf"] = mi.load_dict(part.bsdf) if bsdfs is None else bsdfs[index]
+        properties["mesh_bsdf"] = load_bsdf(part) if bsdfs is None else bsdfs[index]
         mesh = mi.Mesh(
             f"{mesostructure.name}_{index}",
             len(part.vertices),

@@ -11,6 +11,7 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.mesostructure import build
+from btfref.mesostructure.materials import load_bsdf
 from btfref.numerics.directions import directions
 from btfref.sampling.layout import CONVENTIONS, TILE, check_finite, remove_leftovers, remove_store
 from btfref.sampling.part import Part
@@ -188,6 +189,9 @@ class _Job:
             pass
         self.views, self.lights = directions(views), directions(lights)
         self.mesostructure = build(mesostructure, **parameters)
+        with mitsuba_variant(variant):
+            for part in self.mesostructure.parts:
+                load_bsdf(part)
         self.attributes = {
             "seed": self.seed,
             "estimator": estimator,
@@ -328,6 +332,9 @@ def _digest(mesostructure):
     state = hashlib.sha256()
     for part in mesostructure.parts:
         state.update(json.dumps(part.bsdf, sort_keys=True).encode())
+        for name, image in sorted(part.textures.items()):
+            state.update(f"{name} {image.dtype} {image.shape}".encode())
+            state.update(np.ascontiguousarray(image).tobytes())
         for array in (part.vertices, part.faces, part.normals, part.uv):
             if array is not None:
                 state.update(str((array.dtype, array.shape)).encode())

@@ -36,6 +36,7 @@ class TiledScene:
     def __init__(self, mesostructure, directions):
         import mitsuba as mi
 
+        from btfref.mesostructure.materials import load_bsdf
         from btfref.mesostructure.tiling import tiled_shapes
 
         self.low, self.high = mesostructure.height
@@ -50,7 +51,7 @@ class TiledScene:
         # Geometry that sticks out of its tile must be complete as far as any ray goes.
         margin = self.reach + math.ceil(mesostructure.overhang)
         offsets = range(-margin, margin + 1)
-        self.bsdfs = [mi.load_dict(part.bsdf) for part in mesostructure.parts]
+        self.bsdfs = [load_bsdf(part) for part in mesostructure.parts]
         shapes = tiled_shapes(mesostructure, offsets, offsets, bsdfs=self.bsdfs)
         self.scene = mi.load_dict({"type": "scene", **shapes})
 

@@ -1,0 +1,239 @@
+"""Materials of mesostructure: BSDFs as plain JSON types with their textures as arrays beside them.
+
+Textures are read when the mesostructure is built: what is traced later, in whatever process, is what was
+fingerprinted then. In a BSDF's dict ``{"type": "bitmap", "array": NAME}`` stands for the texture ``NAME`` of
+the part, and ``{"type": "transform", "matrix": rows}`` for a transformation.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from btfref.errors import InputError
+
+#: Images that are read by way of Pillow.
+_IMAGES = (".png", ".jpg", ".jpeg", ".tga", ".bmp")
+
+
+def load_bsdf(part):
+    """The Mitsuba BSDF of a part; set a variant first.
+
+    Parameters
+    ----------
+    part : Part
+
+    Returns
+    -------
+    mitsuba.BSDF
+
+    Raises
+    ------
+    InputError
+        Mitsuba's reason, when it refuses the material.
+    """
+    import mitsuba as mi
+
+    try:
+        return mi.load_dict(_ready(part.bsdf, part.textures, mi))
+    except (RuntimeError, ValueError, TypeError) as error:
+        # The last line is the reason, those before it say where in Mitsuba's own source.
+        reason = " ".join(str(error).split())
+        raise InputError("material that Mitsuba refuses", field="bsdf", got=reason) from error
+
+
+def _ready(value, textures, mi):
+    """A BSDF's dict with its arrays and transformations as Mitsuba takes them."""
+    if not isinstance(value, dict):
+        return value
+    if value.get("type") == "transform":
+        return mi.ScalarTransform4f(np.asarray(value["matrix"], np.float64))
+    result = {key: _ready(entry, textures, mi) for key, entry in value.items() if key != "array"}
+    if "array" in value:
+        array = np.array(textures[value["array"]], order="C")  # a copy: Mitsuba wants it writable
+        result["bitmap"] = mi.Bitmap(array)
+        # As when Mitsuba reads the file: whole numbers are sRGB (where the texture is not raw).
+        result["bitmap"].set_srgb_gamma(array.dtype.kind == "u")
+    return result
+
+
+def read_image(path, *, field="file"):
+    """An image as an array, row 0 first.
+
+    Parameters
+    ----------
+    path : path-like
+        PNG (8 or 16 bits), JPEG, TGA, BMP or OpenEXR.
+    field : str
+        Name of the parameter, for messages.
+
+    Returns
+    -------
+    ndarray (rows, columns, channels)
+        uint8 or uint16 as stored, or float32; one channel (grey) or three (an opacity is dropped).
+
+    Raises
+    ------
+    InputError
+        A file that is missing, cannot be read, or holds values that are not finite.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError("no such file", file=path, field=field)
+    image = _read_exr(path, field) if path.suffix.lower() == ".exr" else _read_pillow(path, field)
+    image = image[..., None] if image.ndim == 2 else image
+    image = image[..., :1] if image.shape[2] < 3 else image[..., :3]
+    if not np.isfinite(image).all():
+        raise InputError("image holds a value that is not finite", file=path, field=field)
+    return np.ascontiguousarray(image)
+
+
+def _read_exr(path, field):
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path)) as file:
+            channels = {name: np.array(c.pixels, np.float32) for name, c in file.channels().items()}
+    except (RuntimeError, OSError, ValueError) as error:
+        raise InputError("cannot read the image", file=path, field=field, got=error) from None
+    for names in (("RGB",), ("RGBA",), ("R", "G", "B"), ("Y",)):
+        if all(name in channels for name in names):
+            planes = [channels[name] for name in names]
+            return planes[0] if len(planes) == 1 else np.stack(planes, -1)
+    return next(iter(channels.values()))
+
+
+def _read_pillow(path, field):
+    from PIL import Image, UnidentifiedImageError
+
+    if path.suffix.lower() not in _IMAGES:
+        raise InputError(
+            "kind of image", file=path, field=field, expected=f"one of {', '.join((*_IMAGES, '.exr'))}"
+        )
+    try:
+        with Image.open(path) as image:
+            if image.mode in ("P", "1", "LA", "PA", "CMYK"):
+                image = image.convert("RGB" if image.mode in ("P", "CMYK") else "L")
+            array = np.asarray(image)
+    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+        raise InputError("cannot read the image", file=path, field=field, got=error) from None
+    # Pillow hands 16-bit grey out as 32-bit whole numbers in some versions.
+    return array.astype(np.uint16) if array.dtype == np.int32 else array
+
+
+def as_numbers(image):
+    """Values of an image as float64: whole numbers as shares of their range, floats as they are."""
+    if image.dtype.kind == "f":
+        return image.astype(np.float64)
+    return image / float(np.iinfo(image.dtype).max)
+
+
+def linear_colours(image):
+    """Colours of an image, linear RGB float32 (rows, columns, 3): 8- and 16-bit images hold sRGB."""
+    from btfref.compare.colour import decode_srgb
+
+    values = as_numbers(image) if image.dtype.kind == "f" else decode_srgb(as_numbers(image))
+    return np.broadcast_to(values, (*values.shape[:2], 3)).astype(np.float32)
+
+
+def texture(name):
+    """A texture of plain numbers (linear colours) for a BSDF's dict; the array is the part's."""
+    return {"type": "bitmap", "array": name, "raw": True, "format": "variant"}
+
+
+def bsdf_from_xml(path):
+    """The BSDF of a Mitsuba XML file, with its textures.
+
+    Parameters
+    ----------
+    path : path-like
+        A file whose root is one ``<bsdf>``, or a ``<scene>`` with one BSDF that no other holds.
+
+    Returns
+    -------
+    bsdf : dict
+    textures : dict of str to ndarray
+
+    Raises
+    ------
+    InputError
+        A file that is missing or malformed, that holds no BSDF or several, or a texture that cannot be read.
+    """
+    import mitsuba as mi
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError("no such file", file=path, field="bsdf")
+    previous = mi.variant()
+    mi.set_variant("scalar_rgb")  # parsing needs types; nothing is instantiated
+    try:
+        config = mi.parser.ParserConfig("scalar_rgb")
+        config.merge_equivalent = config.merge_meshes = False
+        state = mi.parser.parse_file(config, str(path))
+        mi.parser.transform_all(config, state)
+        return _described(state.nodes, path, mi)
+    except (RuntimeError, ValueError, TypeError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError("cannot read the material", file=path, field="bsdf", got=error) from None
+    finally:
+        if previous is not None:
+            mi.set_variant(previous)
+
+
+def _described(nodes, path, mi):
+    materials = {k for k, node in enumerate(nodes) if str(node.type) == "ObjectType.BSDF"}
+    inner = {index for k in materials for index in _references(nodes[k].props)}
+    outer = sorted(materials - inner)
+    if len(outer) != 1:
+        raise InputError(
+            "materials in the file", file=path, field="bsdf", got=len(outer), expected="one <bsdf>"
+        )
+    textures = {}
+    return _node(nodes, outer[0], path, textures, mi), textures
+
+
+def _references(props):
+    return [props[key].index() for key in props.keys() if type(props[key]).__name__ == "ResolvedReference"]
+
+
+def _node(nodes, index, path, textures, mi):
+    """One plugin of a parsed file as a dict of JSON types; images and data files become textures."""
+    props = nodes[index].props
+    result = {"type": props.plugin_name()}
+    for key in props.keys():
+        value = props[key]
+        kind = type(value).__name__
+        if kind == "ResolvedReference":
+            result[key] = _node(nodes, value.index(), path, textures, mi)
+        elif kind.startswith("ScalarColor") or kind.startswith("Color"):
+            result[key] = {"type": "rgb", "value": [float(x) for x in value]}
+        elif "Transform" in kind:
+            result[key] = {"type": "transform", "matrix": np.array(value.matrix, np.float64).tolist()}
+        elif isinstance(value, bool | int | float | str):
+            result[key] = value
+        else:
+            raise InputError(
+                "kind of value in a material", file=path, field=key, got=kind, expected="number, text, colour"
+            )
+    if isinstance(result.get("filename"), str):
+        _take_file(result, path, textures)
+    return result
+
+
+def _take_file(plugin, path, textures):
+    """Read a plugin's file, looked up beside the XML file first, as Mitsuba does."""
+    name = plugin["filename"]
+    found = next((p for p in (path.parent / name, Path(name)) if p.is_file()), None)
+    if found is None:
+        raise InputError("no such file", file=path, field="filename", got=name)
+    if plugin["type"] == "bitmap":
+        key = f"texture_{len(textures)}"
+        textures[key] = read_image(found, field="filename")
+        del plugin["filename"]
+        plugin["array"] = key
+    else:
+        # Only Mitsuba can read it: the path goes on, the bytes are fingerprinted.
+        plugin["filename"] = str(found.resolve())
+        textures[f"file_{len(textures)}"] = np.frombuffer(found.read_bytes(), np.uint8)
