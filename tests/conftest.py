@@ -89,6 +89,14 @@ def reference_file():
     return find
 
 
+@pytest.fixture(scope="session")
+def fits(tmp_path_factory):
+    """Fits of every method to the oracle's tables, made on first use: see `oracle.Fits`."""
+    from oracle import Fits
+
+    return Fits(tmp_path_factory.mktemp("fits"))
+
+
 @pytest.fixture
 def rng():
     """A generator with a fixed seed."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from btfref.numerics.directions import directions
+from btfref.registry import method
+from btfref.representations import save
 from btfref.sampling import SampledBTF
 
 
@@ -37,3 +39,55 @@ def oracle_btf(shape=(16, 12), views="ubo81", lights="ubo81", dtype="float16", s
     return SampledBTF(
         values=values, views=views, lights=lights, variance=None, attributes={"mesostructure": "oracle"}
     )
+
+
+def scattered(n=81, seed=3):
+    """Directions without rings: `n` unit vectors of the upper hemisphere, shape (n, 3)."""
+    w = np.random.default_rng(seed).normal(size=(n, 3))
+    w[:, 2] = np.abs(w[:, 2])
+    return w / np.linalg.norm(w, axis=1, keepdims=True)
+
+
+#: Sets of (views, lights): rings, rings with shifted azimuths, sets without a pole or rings of their own, no rings.
+KINDS = {
+    "ubo81": ("ubo81", "ubo81"),
+    "shifted": ("ubo151", "ubo81"),
+    "triangles": ("10x5", "16x8"),
+    "scattered": (scattered(seed=3), scattered(seed=4)),
+}
+
+#: Texels of the tables that all registered methods are fitted to.
+SHAPE = (16, 12)
+
+
+class Fits:
+    """Every method fitted once to each kind of table, with its defaults; shared by all tests of a run.
+
+    Parameters
+    ----------
+    directory : Path
+        For the files.
+    """
+
+    def __init__(self, directory):
+        self._directory, self._btfs, self._made, self._written = directory, {}, {}, set()
+
+    def btf(self, kind="ubo81"):
+        """The table; see KINDS."""
+        if kind not in self._btfs:
+            self._btfs[kind] = oracle_btf(SHAPE, *KINDS[kind])
+        return self._btfs[kind]
+
+    def __call__(self, key, kind="ubo81"):
+        """The representation; not to be changed."""
+        if (key, kind) not in self._made:
+            self._made[key, kind] = method(key).fit(self.btf(kind))
+        return self._made[key, kind]
+
+    def path(self, key, kind="ubo81"):
+        """The representation's file; not to be changed."""
+        path = self._directory / f"{kind}.{key}.exr"
+        if path not in self._written:
+            save(self(key, kind), path)
+            self._written.add(path)
+        return path

@@ -4,46 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
-from oracle import oracle_btf
-from probes import hemisphere, probe_points
+from probes import probe_points
 
 from btfref.compare.comparison import agreement
 from btfref.conventions import FILTER_TYPES
 from btfref.registry import methods
-from btfref.representations import save
 
 N_PROBES = 24_000
 SETS = ("ubo81", "scattered")
-
-
-def directions_of(kind, rng):
-    """``ubo81`` on rings, or the same number of scattered directions, where no rings are found."""
-    if kind == "ubo81":
-        return kind
-    w = hemisphere(rng, 81).astype(float)
-    return w / np.linalg.norm(w, axis=1, keepdims=True)
-
-
-@pytest.fixture(scope="module")
-def btfs():
-    rng = np.random.default_rng(3)
-    return {kind: oracle_btf((24, 20), directions_of(kind, rng), directions_of(kind, rng)) for kind in SETS}
-
-
-@pytest.fixture(scope="module")
-def fitted(btfs, tmp_path_factory):
-    """Representations by (method, set), each fitted and written once."""
-    folder, cache = tmp_path_factory.mktemp("representations"), {}
-
-    def get(key, kind):
-        if (key, kind) not in cache:
-            representation = methods()[key].fit(btfs[kind])
-            path = folder / f"{kind}.{key}.exr"
-            save(representation, path)
-            cache[key, kind] = representation, path
-        return cache[key, kind]
-
-    return get
 
 
 def with_filter(representation, filter_type):
@@ -59,11 +27,11 @@ def off_texel_edges(uv, shape):
 
 
 @pytest.fixture(params=[(k, s, f) for k in methods() for s in SETS for f in FILTER_TYPES], ids="-".join)
-def case(request, btfs, fitted):
+def case(request, fits):
     key, kind, filter_type = request.param
-    representation, path = fitted(key, kind)
-    representation = with_filter(representation, filter_type)
-    btf = btfs[kind]
+    path = fits.path(key, kind)
+    representation = with_filter(fits(key, kind), filter_type)
+    btf = fits.btf(kind)
     uv, w_light, w_view = probe_points(np.random.default_rng(7), N_PROBES, btf.views, btf.lights)
     if filter_type == "nearest":
         uv = off_texel_edges(uv, representation.meta["texels"])
@@ -100,18 +68,16 @@ def test_glsl_agrees(case, need):
 
 
 @pytest.mark.parametrize("key", methods())
-def test_swapped_directions_are_caught(key, fitted, btfs):
+def test_swapped_directions_are_caught(key, fits):
     """A BTF is not reciprocal: an evaluator that swaps light and view must not pass."""
-    representation, _ = fitted(key, "ubo81")
-    uv, w_light, w_view = probe_points(
-        np.random.default_rng(7), 2000, btfs["ubo81"].views, btfs["ubo81"].lights
-    )
+    representation, btf = fits(key), fits.btf()
+    uv, w_light, w_view = probe_points(np.random.default_rng(7), 2000, btf.views, btf.lights)
     swapped = representation.evaluate(uv, w_view, w_light)
     assert not agreement(swapped, representation.evaluate(uv, w_light, w_view)).passed
 
 
 @pytest.mark.parametrize("key", methods())
-def test_invalid_lookups_are_zero_everywhere(key, fitted, llvm, need):
+def test_invalid_lookups_are_zero_everywhere(key, fits, llvm, need):
     """Below the horizon, NaN, infinite: exactly 0 in all evaluators; non-finite uv count as 0."""
     import drjit as dr
 
@@ -121,7 +87,7 @@ def test_invalid_lookups_are_zero_everywhere(key, fitted, llvm, need):
     need("gl")
     mi = llvm
     mitsuba_plugins.register()
-    representation, path = fitted(key, "ubo81")
+    representation, path = fits(key), fits.path(key)
     up, nan, inf = [0, 0, 1], [np.nan, 0, 1], [0, 0, np.inf]
     down, flat = [0.6, 0, -0.8], [1, 0, 0]
     pairs = [(down, up), (up, down), (flat, up), (up, flat), (nan, up), (up, nan), (inf, up), (up, inf)]

@@ -4,7 +4,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from oracle import oracle_btf
+from oracle import KINDS
 
 from btfref.compare import agreement
 from btfref.numerics.directions import directions
@@ -12,38 +12,10 @@ from btfref.registry import methods
 from btfref.render import composer, gl
 from btfref.render.probe import broadcast_points, probe
 
-#: Sets of directions: rings, rings with shifted azimuths, and sets without a pole or rings of their own.
-DIRECTIONS = {
-    "rings": ("ubo81", "ubo81"),
-    "shifted rings": ("ubo151", "ubo81"),
-    "triangles": ("10x5", "16x8"),
-}
-
-#: Quick settings, where the defaults are made for larger data.
-SETTINGS = {
-    "lpca": {"clusters": 5, "components": 3},
-    "lafortune": {"lobes": 2},
-    "lafortune_lut": {"lobes": 2},
-    "cmf": {"clusters": 9},
-    "hf": {"clusters": 9, "smoothness": 1.0},
-}
+#: Sets of directions: test_evaluators.py has the others.
+SETS = ("shifted", "triangles")
 
 N_POINTS = 20_000
-
-
-@pytest.fixture(scope="module")
-def fitted():
-    """``fitted(method, directions) -> Representation`` of the oracle, made once."""
-    made = {}
-
-    def get(key, kind):
-        if (key, kind) not in made:
-            views, lights = DIRECTIONS[kind]
-            btf = oracle_btf((10, 12), views, lights)
-            made[key, kind] = methods()[key].fit(btf, **SETTINGS.get(key, {}))
-        return made[key, kind]
-
-    return get
 
 
 def points(rng, views, lights, n=N_POINTS):
@@ -79,57 +51,41 @@ def split(rows):
     return rows[:, 0:2], rows[:, 2:5], rows[:, 5:8]
 
 
-@pytest.mark.parametrize("kind", DIRECTIONS)
+@pytest.mark.parametrize("kind", SETS)
 @pytest.mark.parametrize("key", methods())
-def test_probe_agrees_with_the_definition(need, rng, fitted, key, kind):
+def test_probe_agrees_with_the_definition(need, rng, fits, key, kind):
     need("gl")
-    rep = fitted(key, kind)
-    uv, w_light, w_view = split(points(rng, *DIRECTIONS[kind]))
+    rep = fits(key, kind)
+    uv, w_light, w_view = split(points(rng, *KINDS[kind]))
     definition = rep.evaluate(uv, w_light, w_view)
     for result in agreement(probe(rep, uv, w_light, w_view), definition).gates:
         assert result.passed, result.line
 
 
 @pytest.mark.parametrize("key", methods())
-def test_nearest_texel(need, rng, fitted, key):
-    need("gl")
-    rep = fitted(key, "rings")
-    uv, w_light, w_view = split(points(rng, *DIRECTIONS["rings"], n=5000))
-    # On a border of texels either side is right: stay inside.
-    column = np.mod(uv.astype(float) * [12, 10], 1)
-    inside = (abs(column - 0.5) < 0.49).all(1)
-    uv, w_light, w_view = uv[inside], w_light[inside], w_view[inside]
-    nearest = type(rep).from_arrays(rep.arrays(), {**rep.meta, "filter_type": "nearest"})
-    definition = nearest.evaluate(uv, w_light, w_view)
-    assert not np.allclose(definition, rep.evaluate(uv, w_light, w_view))
-    for result in agreement(probe(rep, uv, w_light, w_view, filter_type="nearest"), definition).gates:
-        assert result.passed, result.line
-
-
-@pytest.mark.parametrize("key", methods())
-@pytest.mark.parametrize("kind", ["rings", "triangles"])
-def test_below_the_horizon_is_exactly_zero(need, fitted, key, kind):
+@pytest.mark.parametrize("kind", ["ubo81", "triangles"])
+def test_below_the_horizon_is_exactly_zero(need, fits, key, kind):
     need("gl")
     up, down, level = [0.6, 0, 0.8], [0.6, 0, -0.8], [1, 0, 0]
     bad = [down, level, [np.nan, 0, 1], [0, 0, np.inf], [0, 0, 3], [0, 0, 0]]
     w_light = np.array([*bad, *[up] * len(bad), up])
     w_view = np.array([*[up] * len(bad), *bad, up])
-    values = probe(fitted(key, kind), [0.3, 0.4], w_light, w_view)
+    values = probe(fits(key, kind), [0.3, 0.4], w_light, w_view)
     assert (values[:-1] == 0).all()
     assert (values[-1] != 0).all()
 
 
 @pytest.mark.parametrize("key", methods())
-def test_coordinates_that_are_not_finite_count_as_zero(need, fitted, key):
+def test_coordinates_that_are_not_finite_count_as_zero(need, fits, key):
     need("gl")
-    rep = fitted(key, "rings")
+    rep = fits(key)
     up = [0, 0, 1]
     values = probe(rep, [[np.nan, 0.5], [np.inf, 0.5], [0, 0.5]], up, up)
     assert (values == values[2]).all()
     assert np.isfinite(values).all()
 
 
-def test_a_lost_piece_fails_the_probe(need, rng, fitted, tmp_path, monkeypatch):
+def test_a_lost_piece_fails_the_probe(need, rng, fits, tmp_path, monkeypatch):
     """The gate can fail: Mesa's own atan, which is good to 1e-5, is already too coarse."""
     need("gl")
     from btfref.platform import shader_directory
@@ -139,10 +95,10 @@ def test_a_lost_piece_fails_the_probe(need, rng, fitted, tmp_path, monkeypatch):
     assert coarse != text
     (tmp_path / "lib").mkdir()
     (tmp_path / "lib/angles.glsl").write_text(coarse)
-    rep = fitted("raw", "rings")
+    rep = fits("raw")
     shader, _ = gl.shader_file(rep)
     monkeypatch.setattr(gl, "shader_file", lambda rep: (shader, [tmp_path]))
-    uv, w_light, w_view = split(points(rng, *DIRECTIONS["rings"]))
+    uv, w_light, w_view = split(points(rng, *KINDS["ubo81"]))
     found = agreement(probe(rep, uv, w_light, w_view), rep.evaluate(uv, w_light, w_view))
     assert not found.passed
 
@@ -151,11 +107,11 @@ STAGES = [("hosts/probe.vert", "hosts/probe.frag"), ("hosts/mesh.vert", "hosts/m
 
 
 @pytest.mark.parametrize("target", composer.TARGETS)
-@pytest.mark.parametrize("kind", ["rings", "triangles"])
+@pytest.mark.parametrize("kind", ["ubo81", "triangles"])
 @pytest.mark.parametrize("key", methods())
-def test_glslang_accepts_every_representation_in_every_host(need, fitted, tmp_path, key, kind, target):
+def test_glslang_accepts_every_representation_in_every_host(need, fits, tmp_path, key, kind, target):
     validator = need("glslang")
-    rep = fitted(key, kind)
+    rep = fits(key, kind)
     shader, directories = gl.shader_file(rep)
     for filter_type in ("bilinear", "nearest"):
         defines = {**gl.shader_defines(rep, filter_type=filter_type), "N_LIGHTS": 3}

@@ -12,26 +12,12 @@ UVS = ((0.1, 0.2), (0.72, 0.35), (0.5, 0.5), (0.3, 0.8), (0.9, 0.93))
 VIEWS = {"normal": (0, 0, 1), "oblique": (0.6, 0.2, 0.7), "grazing": (0.9, -0.3, 0.02)}
 SAMPLES = 1_000_000
 
-CASES = [(key, "ubo81") for key in methods()] + [("lpca", "10x5")]
-
-
-@pytest.fixture(scope="module")
-def paths(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("sampling")
-    result = {}
-    for kind, views in (("ubo81", "ubo81"), ("10x5", "10x5")):
-        btf = oracle_btf((24, 20), views, views)
-        for key, row in methods().items():
-            if (key, kind) not in CASES:
-                continue
-            result[key, kind] = folder / f"{kind}.{key}.exr"
-            save(row.fit(btf), result[key, kind])
-    return result
+CASES = [(key, "ubo81") for key in methods()] + [("lpca", "triangles")]
 
 
 @pytest.fixture(params=CASES, ids="-".join)
-def path(request, paths):
-    return paths[request.param]
+def path(request, fits):
+    return fits.path(*request.param)
 
 
 def load(mi, path, **parameters):
@@ -101,34 +87,30 @@ def test_density_integrates_to_one(path, view, llvm):
     mi = llvm
     bsdf = load(mi, path)
     w, solid_angle = grid()
-    for uv in UVS:
-        pdf = np.array(
-            bsdf.pdf(mi.BSDFContext(), interaction(mi, len(w), uv, unit(VIEWS[view])), mi.Vector3f(w.T))
-        )
-        assert abs(pdf @ solid_angle - 1) <= tolerance("pdf.integral.max")
+    si = interaction(mi, len(UVS) * len(w), np.repeat(UVS, len(w), 0).T, unit(VIEWS[view]))
+    pdf = np.array(bsdf.pdf(mi.BSDFContext(), si, mi.Vector3f(np.tile(w, (len(UVS), 1)).T)))
+    integral = pdf.reshape(len(UVS), -1) @ solid_angle
+    assert np.abs(integral - 1).max() <= tolerance("pdf.integral.max")
 
 
 @pytest.mark.parametrize("view", VIEWS)
 def test_weight_is_value_over_density(path, view, llvm, rng):
     """sample() returns eval/pdf and its own pdf(); eval_pdf() is the pair of both."""
     mi = llvm
-    bsdf, context, n = load(mi, path), mi.BSDFContext(), 1 << 16
-    for uv in UVS:
-        si = interaction(mi, n, uv, unit(VIEWS[view]))
-        bs, weight = bsdf.sample(context, si, mi.Float(rng.random(n)), mi.Point2f(rng.random((2, n))))
-        value, pdf = bsdf.eval(context, si, bs.wo), np.array(bsdf.pdf(context, si, bs.wo))
-        both = bsdf.eval_pdf(context, si, bs.wo)
-        value, weight = np.array(value), np.array(weight)
-        scale = np.abs(value).max()
-        assert (pdf > 0).all()
-        assert (np.abs(np.array(bs.pdf) - pdf) <= tolerance("sample.pdf.max") * pdf).all()
-        assert (
-            np.abs(weight * pdf - value)
-            <= tolerance("sample.weight.max") * np.maximum(np.abs(value), 1e-3 * scale)
-        ).all()
-        np.testing.assert_array_equal(np.array(both[0]), value)
-        np.testing.assert_array_equal(np.array(both[1]), pdf)
-        assert (np.array(bs.wo)[2] > 0).all()
+    bsdf, context, n = load(mi, path), mi.BSDFContext(), len(UVS) << 15
+    si = interaction(mi, n, np.repeat(UVS, 1 << 15, 0).T, unit(VIEWS[view]))
+    bs, weight = bsdf.sample(context, si, mi.Float(rng.random(n)), mi.Point2f(rng.random((2, n))))
+    value, pdf = bsdf.eval(context, si, bs.wo), np.array(bsdf.pdf(context, si, bs.wo))
+    both = bsdf.eval_pdf(context, si, bs.wo)
+    value, weight = np.array(value), np.array(weight)
+    scale = np.abs(value).reshape(3, len(UVS), -1).max((0, 2)).repeat(1 << 15)
+    assert (pdf > 0).all()
+    assert (np.abs(np.array(bs.pdf) - pdf) <= tolerance("sample.pdf.max") * pdf).all()
+    error = np.abs(weight * pdf - value)
+    assert (error <= tolerance("sample.weight.max") * np.maximum(np.abs(value), 1e-3 * scale)).all()
+    np.testing.assert_array_equal(np.array(both[0]), value)
+    np.testing.assert_array_equal(np.array(both[1]), pdf)
+    assert (np.array(bs.wo)[2] > 0).all()
 
 
 N_VARIANCE_TEXELS = 96
@@ -177,13 +159,13 @@ def test_lambertian_is_sampled_as_by_cosine(llvm, tmp_path):
     np.testing.assert_allclose(pdf, w[:, 2] / np.pi, rtol=tolerance("sample.lambert.max"))
 
 
-def test_a_wrong_density_is_caught(paths, llvm, tmp_path, monkeypatch):
+def test_a_wrong_density_is_caught(fits, llvm, tmp_path, monkeypatch):
     """The χ² test rejects samples of one view against the density of another."""
     import drjit as dr
 
     monkeypatch.chdir(tmp_path)
     mi = llvm
-    bsdf, context = load(mi, paths["lpca", "ubo81"]), mi.BSDFContext()
+    bsdf, context = load(mi, fits.path("lpca")), mi.BSDFContext()
     test = mi.chi2.ChiSquareTest(
         domain=mi.chi2.SphericalDomain(),
         sample_func=lambda s: (

@@ -2,27 +2,17 @@
 
 import numpy as np
 import pytest
-from oracle import oracle_btf
 from probes import hemisphere, probe_points
 
 from btfref.compare.tolerances import tolerance
 from btfref.errors import InputError
-from btfref.registry import method, methods
-from btfref.representations import load, save
+from btfref.registry import methods
+from btfref.representations import load
 
 
 @pytest.fixture(scope="module")
-def btf():
-    return oracle_btf((8, 6))
-
-
-@pytest.fixture(scope="module")
-def paths(btf, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("plugin")
-    result = {key: folder / f"oracle.{key}.exr" for key in methods()}
-    for key, path in result.items():
-        save(method(key).fit(btf), path)
-    return result
+def btf(fits):
+    return fits.btf()
 
 
 def bsdf(mi, path, **parameters):
@@ -45,15 +35,15 @@ def value(mi, plugin, uv, w_light, w_view, mode=None):
     return np.array(plugin.eval(context, interaction(mi, uv, w_view), mi.Vector3f(np.asarray(w_light).T))).T
 
 
-def test_registers_again_after_a_variant_change(paths, llvm):
+def test_registers_again_after_a_variant_change(fits, llvm):
     import mitsuba_plugins
 
     mi = llvm
-    first = bsdf(mi, paths["lpca"])
+    first = bsdf(mi, fits.path("lpca"))
     mi.set_variant("scalar_rgb")
     mi.set_variant("llvm_ad_rgb")
     mitsuba_plugins.register()
-    second = bsdf(mi, paths["lpca"])
+    second = bsdf(mi, fits.path("lpca"))
     assert str(first) == str(second)
     assert "method=lpca" in str(second)
 
@@ -81,24 +71,24 @@ def test_other_variants_are_refused(variant, need):
         ({"sampling": "none"}, "sampling"),
     ],
 )
-def test_bad_parameters_name_the_field(paths, llvm, parameters, field):
+def test_bad_parameters_name_the_field(fits, llvm, parameters, field):
     with pytest.raises(RuntimeError, match=f"field '{field}'"):
-        bsdf(llvm, paths["raw"], **parameters)
+        bsdf(llvm, fits.path("raw"), **parameters)
 
 
-def test_mirroring_transforms_are_refused(paths, llvm):
+def test_mirroring_transforms_are_refused(fits, llvm):
     with pytest.raises(RuntimeError, match="mirrors"):
-        bsdf(llvm, paths["raw"], to_uv=llvm.ScalarTransform4f().scale([-1, 1, 1]))
+        bsdf(llvm, fits.path("raw"), to_uv=llvm.ScalarTransform4f().scale([-1, 1, 1]))
 
 
-def test_scale_and_transform(paths, llvm, btf, rng):
+def test_scale_and_transform(fits, llvm, btf, rng):
     """``scale`` multiplies; ``to_uv`` moves the texture, and its rotation turns the local frame."""
     mi = llvm
-    representation = load(paths["raw"])
+    representation = load(fits.path("raw"))
     uv, w_light, w_view = probe_points(rng, 2000, btf.views, btf.lights)
     uv = np.mod(uv, 1).astype(np.float32)
     transform = mi.ScalarTransform4f().translate([0.3, 0.1, 0]).rotate([0, 0, 1], 30).scale([2, 2, 1])
-    got = value(mi, bsdf(mi, paths["raw"], scale=2.5, to_uv=transform), uv, w_light, w_view)
+    got = value(mi, bsdf(mi, fits.path("raw"), scale=2.5, to_uv=transform), uv, w_light, w_view)
     angle = np.radians(30)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
@@ -110,9 +100,9 @@ def test_scale_and_transform(paths, llvm, btf, rng):
     assert np.abs(got - expected).max() <= tolerance("plugin.transform.max") * scale
 
 
-def test_importance_transport_swaps_the_roles(paths, llvm, rng):
+def test_importance_transport_swaps_the_roles(fits, llvm, rng):
     mi = llvm
-    plugin = bsdf(mi, paths["lpca"])
+    plugin = bsdf(mi, fits.path("lpca"))
     a, b = hemisphere(rng, 500), hemisphere(rng, 500)
     uv = rng.random((500, 2))
     radiance = value(mi, plugin, uv, a, b)
@@ -121,9 +111,9 @@ def test_importance_transport_swaps_the_roles(paths, llvm, rng):
     assert np.abs(radiance - value(mi, plugin, uv, b, a)).max() > 0.01 * radiance.max()
 
 
-def test_twosided_mirrors(paths, llvm, rng):
+def test_twosided_mirrors(fits, llvm, rng):
     mi = llvm
-    plugin = bsdf(mi, paths["raw"])
+    plugin = bsdf(mi, fits.path("raw"))
     both = mi.load_dict({"type": "twosided", "bsdf": plugin})
     a, b, uv = hemisphere(rng, 500), hemisphere(rng, 500), rng.random((500, 2))
     np.testing.assert_array_equal(value(mi, both, uv, a, b), value(mi, plugin, uv, a, b))
@@ -132,12 +122,12 @@ def test_twosided_mirrors(paths, llvm, rng):
 
 
 @pytest.mark.parametrize("key", methods())
-def test_maps_are_differentiable(key, paths, llvm, rng):
+def test_maps_are_differentiable(key, fits, llvm, rng):
     """The gradient of the mean value with respect to a map equals the difference quotient along a random direction."""
     import drjit as dr
 
     mi = llvm
-    plugin = bsdf(mi, paths[key])
+    plugin = bsdf(mi, fits.path(key))
     parameters = mi.traverse(plugin)
     # The largest differentiable map.
     name = max(
@@ -167,7 +157,7 @@ def test_maps_are_differentiable(key, paths, llvm, rng):
     assert abs(slope - difference) <= tolerance("plugin.gradient.max") * abs(difference)
 
 
-def test_renders_in_symbolic_mode(paths, llvm):
+def test_renders_in_symbolic_mode(fits, llvm):
     """A path-traced picture with loops and calls recorded, and the same one in evaluated mode."""
     import drjit as dr
 
@@ -181,8 +171,8 @@ def test_renders_in_symbolic_mode(paths, llvm):
                 "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
                 "film": {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}},
             },
-            "shape": {"type": "sphere", "bsdf": {"type": "twosided", "bsdf": bsdf(mi, paths["lpca"])}},
-            "other": {"type": "rectangle", "bsdf": bsdf(mi, paths["svd"])},
+            "shape": {"type": "sphere", "bsdf": {"type": "twosided", "bsdf": bsdf(mi, fits.path("lpca"))}},
+            "other": {"type": "rectangle", "bsdf": bsdf(mi, fits.path("svd"))},
             "light": {"type": "constant"},
         }
     )

@@ -19,8 +19,14 @@ from btfref.representations.container import payload_bytes
 
 
 @pytest.fixture(scope="module")
-def btf():
-    return oracle_btf((16, 12))
+def btf(fits):
+    return fits.btf()
+
+
+@pytest.fixture(scope="module")
+def small():
+    """A table that the definition can be asked for whole."""
+    return oracle_btf((8, 6))
 
 
 @pytest.fixture(params=methods())
@@ -31,6 +37,9 @@ def row(request):
 #: Methods that interpolate tables at the measured directions, and so reproduce what their fit says they keep; models
 #: of reflectance with parameters of their own have tests of their own.
 TABLES = ("raw", "svd", "lpca")
+
+#: Settings that leave an error above the rounding of sums of squares, on few texels.
+COARSE = {"lpca": {"clusters": 4, "components": 3}}
 
 
 def at_samples(btf, representation):
@@ -46,19 +55,19 @@ def relative_error(test, reference):
     return np.sqrt(((test - reference) ** 2).sum() / (reference.astype(float) ** 2).sum())
 
 
-def test_raw_returns_the_samples(btf):
-    value = at_samples(btf, method("raw").fit(btf))
+def test_raw_returns_the_samples(small):
+    value = at_samples(small, method("raw").fit(small))
     np.testing.assert_allclose(
-        value, btf.values, atol=tolerance("interpolation.float32.max") * btf.values.max()
+        value, small.values, atol=tolerance("interpolation.float32.max") * small.values.max()
     )
 
 
 @pytest.mark.parametrize("key", TABLES)
-def test_fit_error_is_what_the_definition_shows(btf, key):
+def test_fit_error_is_what_the_definition_shows(small, key):
     """The error that a fit reports is that of its stored maps, but for their rounding."""
-    representation = method(key).fit(btf)
+    representation = method(key).fit(small, **COARSE.get(key, {}))
     stated = np.sqrt(representation.meta.get("fit", {}).get("error", 0.0))
-    measured = relative_error(at_samples(btf, representation), btf.values)
+    measured = relative_error(at_samples(small, representation), small.values)
     assert abs(measured - stated) <= tolerance("fit.stated.max")
     assert measured < tolerance("fit.oracle.max")
 
@@ -71,8 +80,8 @@ def test_more_components_are_never_worse(btf):
         assert errors == sorted(errors, reverse=True)
 
 
-def test_files_come_back_exactly(btf, row, tmp_path):
-    representation = row.fit(btf)
+def test_files_come_back_exactly(btf, row, fits, tmp_path):
+    representation = fits(row.key)
     path = tmp_path / f"x.{row.key}.exr"
     save(representation, path)
     again = load(path)
@@ -85,10 +94,8 @@ def test_files_come_back_exactly(btf, row, tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_info_reads_headers(btf, row, tmp_path):
-    representation = row.fit(btf)
-    path = tmp_path / f"x.{row.key}.exr"
-    save(representation, path)
+def test_info_reads_headers(row, fits):
+    path = fits.path(row.key)
     info = read_info(path)
     assert info["kind"] == "representation"
     assert info["method"] == row.key
@@ -110,8 +117,8 @@ def test_payload_counts_the_maps_alone():
     assert payload_bytes(maps, {"index_bytes": {"cluster": 1}}) == 16 * 5 * 6561 * 3 * 4 + 65536 * 17
 
 
-def test_fits_are_deterministic(btf, row):
-    a, b = row.fit(btf, seed=3), row.fit(btf, seed=3)
+def test_fits_are_deterministic(btf, row, fits):
+    a, b = fits(row.key), row.fit(btf)
     for name, array in a.arrays().items():
         np.testing.assert_array_equal(array, b.arrays()[name])
 
@@ -139,8 +146,8 @@ def test_degenerate_data(values, shape, row):
     assert group.max() < len(mean)
 
 
-def test_half_floats_never_overflow_in_silence(btf):
-    huge = dataclasses.replace(btf, values=btf.values.astype(np.float32) * 1e6)
+def test_half_floats_never_overflow_in_silence(small):
+    huge = dataclasses.replace(small, values=small.values.astype(np.float32) * 1e6)
     for key in ("svd", "lpca"):
         with pytest.raises(InputError, match="do not fit"):
             method(key).fit(huge)
