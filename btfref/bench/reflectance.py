@@ -12,6 +12,7 @@ polynomials; peaks and exponents of lobes need the range of a half.
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
 from btfref.bench.timing import machine
 from btfref.errors import InputError
@@ -51,7 +52,7 @@ def run(*, quick=False, progress=None, btf=None, only=None):
         raise InputError("no such column", field="only", got=", ".join(only), expected=", ".join(METHODS))
     names = MESOSTRUCTURES[:1] if quick else MESOSTRUCTURES
     if btf is not None:
-        names = (str(btf.attributes.get("mesostructure", "measured")),)
+        names = (material_name(btf),)
     summary, raw = {}, {}
     for name in names:
         data = btf if btf is not None else synthesize(name, texels=TEXELS, spp=SPP, progress=progress)
@@ -65,6 +66,15 @@ def run(*, quick=False, progress=None, btf=None, only=None):
         "summary": summary,
         "machine": machine(),
     }
+
+
+def material_name(btf):
+    """What a BTF is of: its mesostructure if it was synthesized, else the name of its file."""
+    parent = btf.attributes.get("parent", {})
+    if "mesostructure" in (parent.get("kind"), *btf.attributes):
+        return str(parent.get("name", btf.attributes.get("mesostructure")))
+    path = getattr(btf, "path", None)
+    return Path(path).name.removesuffix(".btf.zarr") if path else "BTF"
 
 
 def fitted(btf, key):

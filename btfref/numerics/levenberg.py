@@ -5,8 +5,9 @@ H. B. Nielsen, "Damping Parameter in Marquardt's Method", IMM-REP-1999-05; tests
 Levenberg–Marquardt Algorithm: Implementation and Theory", 1978 (MINPACK). Bounds by an active set: a parameter on its
 bound that the gradient pushes outwards is left out of the step; the others are clipped.
 
-Thousands to millions of small fits run side by side on LLVM or CUDA. Each iteration is one kernel that solves for the
-step, evaluates residuals and Jacobian at the trial point and accepts or rejects it; converged lanes leave the batch.
+Thousands to millions of small fits run side by side on LLVM or CUDA, all of them in one kernel: each iteration solves
+for the step, evaluates residuals and Jacobian at the trial point and accepts or rejects it; a lane whose fit has ended
+writes it out and takes the next one that nobody has.
 """
 
 from __future__ import annotations
@@ -24,11 +25,15 @@ STATUS = {
     4: "residual zero",
 }
 
-#: Lanes that are fitted at a time: bounds the memory of the normal equations.
-LANES = 1 << 19
+#: Fits of one launch: bounds the time between two reports of progress.
+LAUNCH = 1 << 17
 
-_FIRST_DAMPING = 1e-2
+#: Lanes of a launch; each takes the next fit when its own has ended.
+RUNNING_LANES = 1 << 10
+
+_FIRST_DAMPING = 1e-1
 _TINY = 1e-30
+
 
 #: Share of the range of a parameter within which a step may end on the bound.
 _NEAR_BOUND = 2e-3
@@ -93,11 +98,11 @@ def backend():
 
 
 def fit_batch(
-    residual,
+    model,
     start,
     lower,
     upper,
-    n_samples,
+    n_steps,
     *,
     iterations=100,
     gtol=1e-4,
@@ -105,19 +110,20 @@ def fit_batch(
     xtol=1e-5,
     progress=None,
 ):
-    """Minimise ``½ Σ_s r(p, lane, s)²`` over p within bounds, for each lane on its own.
+    """Minimise ``½ Σ_s r_s(p, fit)²`` over p within bounds, for each of N fits on its own.
 
     Parameters
     ----------
-    residual : callable
-        ``(parameters, lane, sample) -> (r, [∂r/∂p_0, …])`` with Dr.Jit floats of the module :func:`backend`;
-        ``parameters`` is a list of P floats, ``lane`` and ``sample`` are UInt32. It is recorded inside a loop over
-        samples: no data-dependent Python control flow.
+    model : callable
+        ``(p, fit) -> (samples, units)`` with Dr.Jit floats of the module :func:`backend`: ``p`` is a list of P floats,
+        ``fit`` a UInt32. ``samples(step)`` lists, for one or several samples, ``(r, [u_0, …])`` such that
+        ``∂r/∂p_i = u_i units[i]``: what all samples share stays out of their loop. It is recorded in that loop: no
+        data-dependent Python control flow.
     start : array_like, shape (N, P)
         Clipped to the bounds.
     lower, upper : array_like, shape (P,) or (N, P)
-    n_samples : int
-        Of each lane.
+    n_steps : int
+        Steps of the loop over the samples of a fit.
     iterations : int
         At most so many steps are tried.
     gtol : float
@@ -137,116 +143,112 @@ def fit_batch(
     start = np.atleast_2d(np.asarray(start, np.float32))
     n = len(start)
     lower, upper = (np.broadcast_to(np.asarray(b, np.float32), start.shape) for b in (lower, upper))
-    parameters = np.clip(start, lower, upper)
-    cost, status = np.zeros(n, np.float32), np.zeros(n, np.uint8)
-    count = np.zeros(n, np.uint16)
-    for first in range(0, n, LANES):
-        part = slice(first, min(first + LANES, n))
-        solver = _Solver(
-            residual, first, parameters[part], lower[part], upper[part], n_samples, (gtol, ftol, xtol)
-        )
-        solver.run(iterations, (lambda done, first=first: progress(first + done, n)) if progress else None)
-        parameters[part], cost[part], status[part], count[part] = solver.results()
+    start = np.clip(start, lower, upper)
+    solver = _Solver(model, start, lower, upper, n_steps, iterations, (gtol, ftol, xtol))
+    parameters, cost = np.zeros_like(start), np.zeros(n, np.float32)
+    status, count = np.zeros(n, np.uint8), np.zeros(n, np.uint16)
+    for first in range(0, n, LAUNCH):
+        part = slice(first, min(first + LAUNCH, n))
+        parameters[part], cost[part], status[part], count[part] = solver.run(part.start, part.stop)
+        if progress:
+            progress(part.stop, n)
     return BatchFit(parameters, cost, status, count)
 
 
 class _Solver:
-    """State of one batch; lanes that have ended are written to the results and leave the state."""
+    """One launch: lanes that take the next fit when theirs has ended, until none is left.
 
-    def __init__(self, residual, first, start, lower, upper, n_samples, tolerances):
+    The whole iteration, solution, residuals and all, is one loop within one kernel: the normal equations stay in
+    registers, and no lane waits for the slowest of a batch.
+    """
+
+    def __init__(self, model, start, lower, upper, n_steps, iterations, tolerances):
         self.module = backend()
         import drjit as dr
 
-        # Opaque numbers: one kernel serves batches of any size.
-        self.residual = residual
-        self.n_samples, self.first = (dr.opaque(self.module.UInt32, k) for k in (n_samples, first))
-        self.tolerances = tolerances
+        UInt32 = self.module.UInt32
+        self.model, self.tolerances = model, tolerances
         self.size, self.width = start.shape
+        # Opaque numbers: one kernel serves any batch.
+        self.n_steps, self.limit = (dr.opaque(UInt32, k) for k in (n_steps, iterations))
+        self.start, self.lower, self.upper = (
+            self.module.Float(np.ascontiguousarray(a, np.float32).ravel()) for a in (start, lower, upper)
+        )
+
+    def run(self, first, last):
+        """Fit ``first`` to ``last − 1``: parameters, cost, status and iterations as NumPy arrays."""
+        import drjit as dr
+
         Float, UInt32 = self.module.Float, self.module.UInt32
-        columns = lambda a: [Float(np.ascontiguousarray(a[:, i])) for i in range(self.width)]  # noqa: E731
-        self.bounds = columns(lower), columns(upper)
-        self.out = [Float(c) for c in columns(start)]
-        self.out_cost = Float(np.zeros(self.size, np.float32))
-        self.out_status = UInt32(np.zeros(self.size, np.uint32))
-        self.out_count = UInt32(np.zeros(self.size, np.uint32))
-        lane = dr.arange(UInt32, self.size)
-        p = columns(start)
-        cost, gradient, hessian = self._normal_equations(p, lane)
-        damping, growth = dr.full(Float, _FIRST_DAMPING, self.size), dr.full(Float, 2.0, self.size)
-        status = dr.zeros(UInt32, self.size)
-        self.state = [p, cost, gradient, hessian, damping, growth, status, dr.zeros(UInt32, self.size), lane]
-        # Literals would be compiled into the first kernels, and differ from those of later steps.
-        dr.make_opaque(self.state)
+        size, width = last - first, self.width
+        lanes = min(size, RUNNING_LANES)
+        out = [dr.zeros(Float, size * width), dr.zeros(Float, size)]
+        out += [dr.zeros(UInt32, size), dr.zeros(UInt32, size)]
+        begin, end, taken = dr.opaque(UInt32, first), dr.opaque(UInt32, last), UInt32([first + lanes])
+        fit = begin + dr.arange(UInt32, lanes)
+        dr.eval(out, taken, fit)
+        # Python scalars and literals would be compiled into the kernel as constants of the first iteration.
+        many = lambda n: [dr.zeros(Float, lanes) for _ in range(n)]  # noqa: E731
+        state = (fit, dr.zeros(UInt32, lanes), many(width), many(1)[0], many(width))
+        state += (many(width * (width + 1) // 2), many(1)[0], many(1)[0])
+        dr.make_opaque(state)
 
-    def run(self, iterations, progress):
-        """Iterate until all lanes have ended or the iterations are used up."""
-        import drjit as dr
+        def body(fit, count, p, cost, gradient, hessian, damping, growth):
+            p, cost, gradient, hessian, damping, growth, status = self._step(
+                fit, count == 0, p, cost, gradient, hessian, damping, growth
+            )
+            ended = (status > 0) | (count >= self.limit)
+            place = fit - begin
+            for i in range(width):
+                dr.scatter(out[0], p[i], place * width + i, ended)
+            dr.scatter(out[1], cost, place, ended)
+            dr.scatter(out[2], status, place, ended)
+            dr.scatter(out[3], count, place, ended)
+            following = dr.scatter_inc(taken, UInt32(0), ended)
+            fit, count = dr.select(ended, following, fit), dr.select(ended, 0, count + 1)
+            return fit, count, p, cost, gradient, hessian, damping, growth
 
-        for step in range(iterations):
-            self._step()
-            if step % 4 == 3 or step == iterations - 1:
-                running = self.state[6] == 0
-                left = dr.count(running)[0]
-                if progress:
-                    progress(self.size - left)
-                if left == 0:
-                    break
-                if left < 0.75 * dr.width(running):
-                    self._write()
-                    keep = dr.compress(running)
-                    self.state = _gathered(dr, self.state, keep)
-                    dr.eval(self.state)
-        self._write()
+        dr.while_loop(state, lambda fit, *_: fit < end, body, label="fits")
+        dr.eval(out)
+        parameters, cost, status, count = (np.array(a) for a in out)
+        return parameters.reshape(size, width), cost, status, count
 
-    def results(self):
-        """Parameters, cost, status and iterations as NumPy arrays."""
-        parameters = np.stack([np.array(c) for c in self.out], 1)
-        return parameters, np.array(self.out_cost), np.array(self.out_status), np.array(self.out_count)
-
-    def _write(self):
-        import drjit as dr
-
-        p, cost, _, _, _, _, status, count, lane = self.state
-        for target, value in zip(self.out, p, strict=True):
-            dr.scatter(target, value, lane)
-        dr.scatter(self.out_cost, cost, lane)
-        dr.scatter(self.out_status, status, lane)
-        dr.scatter(self.out_count, count, lane)
-        dr.eval(self.out, self.out_cost, self.out_status, self.out_count)
-
-    def _normal_equations(self, p, lane):
+    def _normal_equations(self, p, fit):
         """Cost, gradient Jᵀr, and the upper triangle of JᵀJ row by row, by one pass over the samples."""
         import drjit as dr
 
         Float, UInt32 = self.module.Float, self.module.UInt32
-        width, first, residual, n_samples = self.width, self.first, self.residual, self.n_samples
-        zeros = lambda n: [dr.zeros(Float, dr.width(lane)) for _ in range(n)]  # noqa: E731
+        width, n_steps = self.width, self.n_steps
+        zeros = lambda n: [dr.zeros(Float, dr.width(fit)) for _ in range(n)]  # noqa: E731
+        pairs = [(i, j) for i in range(width) for j in range(i, width)]
+        # Copies: an in-place operation of the model must not reach the state.
+        samples, units = self.model([Float(x) for x in p], fit)
 
-        def body(sample, cost, gradient, hessian):
-            # Copies: an in-place operation of the model must not reach the state.
-            r, row = residual([Float(x) for x in p], lane + first, sample)
-            cost = dr.fma(0.5 * r, r, cost)
-            gradient = [dr.fma(row[i], r, gradient[i]) for i in range(width)]
-            pairs = [(i, j) for i in range(width) for j in range(i, width)]
-            hessian = [dr.fma(row[i], row[j], h) for (i, j), h in zip(pairs, hessian, strict=True)]
-            return sample + 1, cost, gradient, hessian
+        def body(step, cost, gradient, hessian):
+            for r, row in samples(step):
+                cost = dr.fma(r, r, cost)
+                gradient = [dr.fma(row[i], r, gradient[i]) for i in range(width)]
+                hessian = [dr.fma(row[i], row[j], h) for (i, j), h in zip(pairs, hessian, strict=True)]
+            return step + 1, cost, gradient, hessian
 
         _, cost, gradient, hessian = dr.while_loop(
-            (UInt32(0), *zeros(1), zeros(width), zeros(width * (width + 1) // 2)),
-            lambda sample, *_: sample < n_samples,
+            (UInt32(0), *zeros(1), zeros(width), zeros(len(pairs))),
+            lambda step, *_: step < n_steps,
             body,
             label="samples",
         )
-        return cost, gradient, hessian
+        gradient = [g * unit for g, unit in zip(gradient, units, strict=True)]
+        hessian = [h * (units[i] * units[j]) for (i, j), h in zip(pairs, hessian, strict=True)]
+        return 0.5 * cost, gradient, hessian
 
-    def _step(self):
-        """One trial step of every lane of the state."""
+    def _step(self, fit, fresh, p, cost, gradient, hessian, damping, growth):
+        """One trial step, or the start of a fresh fit; returns the state and how the fit ended, 0 if it did not."""
         import drjit as dr
 
-        p, cost, gradient, hessian, damping, growth, status, count, lane = self.state
         gtol, ftol, xtol = self.tolerances
-        width = range(self.width)
-        low, high = ([dr.gather(type(b), b, lane) for b in bounds] for bounds in self.bounds)
+        Float, width = self.module.Float, range(self.width)
+        at_fit = lambda table, i: dr.gather(Float, table, fit * self.width + i)  # noqa: E731
+        low, high = ([at_fit(table, i) for i in width] for table in (self.lower, self.upper))
         frozen = [
             ((p[i] <= low[i]) & (gradient[i] >= 0)) | ((p[i] >= high[i]) & (gradient[i] <= 0)) for i in width
         ]
@@ -258,13 +260,16 @@ class _Solver:
         dead = [frozen[i] | (at[i, i] <= _TINY) for i in width]
         cosine = [dr.select(dead[i], 0, gradient[i] * scale[i]) for i in width]
         step = _damped_solution(dr, at, scale, dead, cosine, damping)
-        trial = [_towards(dr, p[i], step[i], low[i], high[i]) for i in width]
+        trial = [
+            dr.select(fresh, at_fit(self.start, i), _towards(dr, p[i], step[i], low[i], high[i]))
+            for i in width
+        ]
         step = [trial[i] - p[i] for i in width]
         predicted = -sum(
             step[i] * (gradient[i] + 0.5 * sum(at[i, j] * step[j] for j in width)) for i in width
         )
 
-        new_cost, new_gradient, new_hessian = self._normal_equations(trial, lane)
+        new_cost, new_gradient, new_hessian = self._normal_equations(trial, fit)
         # NaN compares false: a trial that is not finite is rejected.
         better = new_cost < cost
         actual = cost - new_cost
@@ -272,26 +277,25 @@ class _Solver:
         largest = sum_max(dr, [dr.abs(c) for c in cosine]) * dr.rsqrt(dr.maximum(2 * cost, _TINY))
         still = sum_max(dr, [dr.abs(step[i]) - xtol * (dr.abs(p[i]) + xtol) for i in width]) <= 0
         flat = (predicted <= ftol * cost) & (dr.abs(actual) <= ftol * cost)
-        ended = dr.select(
+        status = dr.select(
             cost <= _TINY, 4, dr.select(largest <= gtol, 1, dr.select(flat, 2, dr.select(still, 3, 0)))
         )
-        running = status == 0
-        take = running & better
         bend = 2 * gain - 1
-        self.state = [
-            [dr.select(take, trial[i], p[i]) for i in width],
+        damping = dr.clip(
+            damping * dr.select(better, dr.maximum(1 / 3, 1 - bend * bend * bend), growth), 1e-7, 1e10
+        )
+        growth = dr.select(better, 2, dr.minimum(2 * growth, 64))
+        take = fresh | better
+        choose = lambda new, old: [dr.select(take, a, b) for a, b in zip(new, old, strict=True)]  # noqa: E731
+        return (
+            choose(trial, p),
             dr.select(take, new_cost, cost),
-            [dr.select(take, a, b) for a, b in zip(new_gradient, gradient, strict=True)],
-            [dr.select(take, a, b) for a, b in zip(new_hessian, hessian, strict=True)],
-            dr.clip(
-                damping * dr.select(better, dr.maximum(1 / 3, 1 - bend * bend * bend), growth), 1e-7, 1e10
-            ),
-            dr.select(better, 2, dr.minimum(2 * growth, 64)),
-            dr.select(running, ended, status),
-            count + dr.select(running, self.module.UInt32(1), 0),
-            lane,
-        ]
-        dr.eval(self.state)
+            choose(new_gradient, gradient),
+            choose(new_hessian, hessian),
+            dr.select(fresh, _FIRST_DAMPING, damping),
+            dr.select(fresh, 2, growth),
+            dr.select(fresh, self.module.UInt32(0), self.module.UInt32(status)),
+        )
 
 
 def sum_max(dr, values):
@@ -339,9 +343,3 @@ def _towards(dr, p, step, low, high):
     floor = dr.select(p - low <= near, low, dr.fma(0.9, low - p, p))
     ceiling = dr.select(high - p <= near, high, dr.fma(0.9, high - p, p))
     return dr.clip(p + step, floor, ceiling)
-
-
-def _gathered(dr, tree, index):
-    if isinstance(tree, list):
-        return [_gathered(dr, item, index) for item in tree]
-    return dr.gather(type(tree), tree, index)

@@ -83,55 +83,63 @@ def luminance_tables(maps, texels, views):
     return result * lights[:, 2]
 
 
-def lafortune_residual(module, luminance, views, lights, n_lobes, factor=None):
-    """Residual and Jacobian for :func:`fit_batch`.
+def lafortune_model(module, data, views, lights, n_lobes, factor=None):
+    """Residuals and Jacobian for :func:`fit_batch`; a step is a pair of directions.
 
     Parameters
     ----------
     module : module
         Of :func:`btfref.numerics.levenberg.backend`.
-    luminance : ndarray of float32, shape (n_views, n_lights, N)
+    data : ndarray of float32, shape (N, n_views, n_lights)
+        Luminance.
     views, lights : ndarray, shape (n, 3)
     n_lobes : int
-    factor : ndarray of float32, shape (n_views, N), optional
+    factor : ndarray of float32, shape (N, n_views), optional
         View-dependent factor of the model.
 
     Returns
     -------
     callable
-        Parameters of each lane: ρ_d; for each lobe the coefficients, natural logarithm of the exponent, peak.
+        Parameters of each fit: ρ_d; for each lobe the coefficients, natural logarithm of the exponent, peak.
     """
     import drjit as dr
 
     Float = module.Float
-    n_lights, n = (dr.opaque(module.UInt32, k) for k in luminance.shape[1:])
-    data = Float(luminance.ravel())
+    n_views, n_lights = (dr.opaque(module.UInt32, k) for k in data.shape[1:])
+    values = Float(data.ravel())
     product = (views[:, None] * lights[None]).astype(np.float32)
     cosine = np.broadcast_to(lights[None, :, 2:], (*product.shape[:2], 1)).astype(np.float32)
     table = Float(np.concatenate([product, cosine], -1).ravel())
     factor = None if factor is None else Float(np.ascontiguousarray(factor, np.float32).ravel())
 
-    def residual(p, lane, sample):
-        *w, scale = dr.gather(module.Array4f, table, sample)
-        if factor is not None:
-            scale = scale * dr.gather(Float, factor, dr.fma(sample // n_lights, n, lane))
-        value, row = p[0], [scale]
+    def model(p, fit):
+        lobes, units = [], [Float(1)]
         for j in range(n_lobes):
             *c, log_exponent, peak = p[1 + 5 * j : 6 + 5 * j]
-            base = dr.fma(c[0], w[0], dr.fma(c[1], w[1], c[2] * w[2]))
-            there = base > FLOOR
             exponent = dr.exp(log_exponent)
-            safe = dr.select(there, base, 1)
-            log = dr.log2(safe)
-            power = dr.select(there, dr.exp2(exponent * log), 0)
-            part = peak * power
-            value = value + part
-            slope = scale * dr.select(there, part * exponent / safe, 0)
-            row += [slope * w[0], slope * w[1], slope * w[2]]
-            row += [scale * part * exponent * log * 0.6931471805599453, scale * power]
-        return dr.fma(value, scale, -dr.gather(Float, data, dr.fma(sample, n, lane))), row
+            lobes.append((c, exponent, peak))
+            slope = peak * exponent
+            units += [slope, slope, slope, slope * 0.6931471805599453, Float(1)]
 
-    return residual
+        def samples(step):
+            *w, scale = dr.gather(module.Array4f, table, step)
+            if factor is not None:
+                scale = scale * dr.gather(Float, factor, dr.fma(fit, n_views, step // n_lights))
+            value, row = p[0] * scale, [scale]
+            for c, exponent, peak in lobes:
+                base = dr.fma(c[0], w[0], dr.fma(c[1], w[1], c[2] * w[2]))
+                there = base > FLOOR
+                log = dr.log2(dr.select(there, base, 1))
+                # The power less one: the derivative by the coefficients needs it.
+                less = dr.select(there, scale * dr.exp2((exponent - 1) * log), 0)
+                power = less * base
+                value = dr.fma(peak, power, value)
+                row += [less * w[0], less * w[1], less * w[2], power * log, power]
+            return [(value - dr.gather(Float, values, dr.fma(fit, n_views * n_lights, step)), row)]
+
+        return samples, units
+
+    return model
 
 
 def bounds(luminance, lights, n_lobes):
@@ -168,11 +176,14 @@ def fit_lafortune(luminance, views, lights, n_lobes, *, start=None, factor=None,
     from btfref.numerics.levenberg import backend
 
     first, lower, upper = bounds(luminance, lights, n_lobes)
-    residual = lafortune_residual(backend(), luminance, views.vectors, lights.vectors, n_lobes, factor)
+    factor = None if factor is None else factor.T
+    model = lafortune_model(
+        backend(), np.moveaxis(luminance, 2, 0), views.vectors, lights.vectors, n_lobes, factor
+    )
     n_samples = len(views) * len(lights)
     start = first if start is None else start
     # Sums over thousands of samples in float32 leave 1e-6 of the cost undetermined.
-    return fit_batch(residual, start, lower, upper, n_samples, iterations=iterations, ftol=1e-5)
+    return fit_batch(model, start, lower, upper, n_samples, iterations=iterations, ftol=1e-5)
 
 
 def lobe_maps(parameters):

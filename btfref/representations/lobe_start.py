@@ -12,6 +12,12 @@ import numpy as np
 #: Exponents tried at a direction; those of a start only have to lie in the right valley.
 EXPONENTS = (1.5, 5.0, 16.0, 50.0)
 
+#: Factor of the parabolic coordinates of an axis that leans away from the normal.
+TILT = 1.2
+
+#: Fits whose starts are found at a time: their products with the dictionary stay in the cache.
+BLOCK = 2048
+
 #: Exponent of the cosine that weights the neighbourhood which the high-pass filter subtracts: half a weight at 24°.
 SMOOTHING = 8.0
 
@@ -41,7 +47,7 @@ def lobe_starts(data, lights, n_lobes, *, high_pass=False):
 
     Parameters
     ----------
-    data : ndarray of float32, shape (n_lights, N)
+    data : ndarray of float32, shape (N, n_lights)
     lights : ndarray, shape (n_lights, 3)
     n_lobes : int
     high_pass : bool
@@ -56,27 +62,65 @@ def lobe_starts(data, lights, n_lobes, *, high_pass=False):
     cosine = np.maximum(lights @ lights.T, 0)
     smooth = cosine**SMOOTHING
     sharpen = (np.eye(len(lights)) - smooth / smooth.sum(1, keepdims=True)).astype(np.float32)
-    shapes = [(cosine**e).astype(np.float32) for e in EXPONENTS]
+    shapes = np.stack([cosine**e for e in EXPONENTS])
+    length = np.sqrt((shapes * shapes).sum(2))
+    # Of length 1: what a shape removes is the square of its product with the data.
+    shapes, length = (shapes / length[..., None]).astype(np.float32), length.astype(np.float32)
     axis = (lights[:, :2] / (1 + lights[:, 2:])).astype(np.float32)
-    column = np.arange(data.shape[1])
-    rest = np.array(data, np.float32)
-    result = []
-    for _ in range(n_lobes):
-        gain, peak, choice = [], [], []
-        direction = np.argmax(sharpen @ rest, 0) if high_pass else None
-        for shape in shapes:
-            projection = np.maximum(shape @ rest, 0)
-            square = (shape * shape).sum(1)
-            at = np.argmax(projection / np.sqrt(square)[:, None], 0) if direction is None else direction
-            gain.append(projection[at, column] ** 2 / square[at])
-            peak.append(projection[at, column] / square[at])
-            choice.append(at)
-        best = np.argmax(gain, 0)
-        chosen, height = np.array(choice)[best, column], np.array(peak)[best, column]
-        for k, shape in enumerate(shapes):
-            here = best == k
-            rest[:, here] -= height[here] * shape[:, chosen[here]]
+    result = np.zeros((len(data), 4 * n_lobes), np.float32)
+    for first in range(0, len(data), BLOCK):
+        part = slice(first, first + BLOCK)
+        rest = np.array(data[part], np.float32)
+        row = np.arange(len(rest))
         # A lobe of no height has no slope in its other parameters: every lobe starts with some.
-        height = np.maximum(height, 0.02 * np.maximum(data.max(0), 0))
-        result += [axis[chosen, 0], axis[chosen, 1], np.log(np.array(EXPONENTS))[best], height]
-    return np.stack(result, 1).astype(np.float32)
+        least = 0.02 * np.maximum(rest.max(1), 0)
+        for j in range(n_lobes):
+            if high_pass:
+                towards = np.argmax(rest @ sharpen.T, 1)
+                gain = np.einsum("ekl,kl->ke", shapes[:, towards], rest).T
+                best = np.argmax(gain, 0)
+                gain = gain[best, row]
+            else:
+                gain = rest @ shapes.reshape(-1, len(lights)).T
+                best, towards = np.divmod(np.argmax(gain, 1), len(lights))
+                gain = gain[row, best * len(lights) + towards]
+            gain = np.maximum(gain, 0)
+            rest -= gain[:, None] * shapes[best, towards]
+            height = np.maximum(gain / length[best, towards], least)
+            exponent = np.log(np.array(EXPONENTS))[best]
+            result[part, 4 * j : 4 * j + 4] = np.stack([*axis[towards].T, exponent, height], 1)
+    return result
+
+
+def tilted_starts(data, lights, parameters):
+    """Another guess from lobes that were found: the highest one leans away from the normal, the rest start anew.
+
+    A highlight at the outermost lights that is sharper than exponents may be is met best by the flank of a lobe whose
+    axis lies beyond them, which optimization from a lobe on the highlight does not find.
+
+    Parameters
+    ----------
+    data : ndarray of float32, shape (N, n_lights)
+    lights : ndarray, shape (n_lights, 3)
+    parameters : ndarray of float32, shape (N, 4 n_lobes)
+
+    Returns
+    -------
+    ndarray of float32, shape (N, 4 n_lobes)
+    """
+    row = np.arange(len(data))
+    lobes = parameters.reshape(len(data), -1, 4)
+    s, t, log_exponent, peak = lobes[row, lobes[..., 3].argmax(1)].T
+    brightest = lights[data.argmax(1)]
+
+    def values(s, t, lights):
+        cosine = (2 * (s * lights[..., 0] + t * lights[..., 1]) + 2 * lights[..., 2]) / (1 + s * s + t * t)
+        return np.maximum(cosine - lights[..., 2], 1e-3) ** np.exp(log_exponent)
+
+    leaning = values(TILT * s, TILT * t, brightest)
+    # The value at the brightest light stays; the peak is bounded by what the solver allows.
+    height = peak * values(s, t, brightest) / np.maximum(leaning, 1e-3)
+    rest = data - (height * values(TILT * s, TILT * t, lights[:, None])).T
+    first = np.stack([TILT * s, TILT * t, log_exponent, height], 1)
+    further = lobe_starts(rest, lights, lobes.shape[1] - 1)
+    return np.concatenate([first, further], 1).astype(np.float32)

@@ -9,8 +9,8 @@ from oracle import oracle_values
 from btfref.compare.tolerances import tolerance
 from btfref.numerics.directions import directions
 from btfref.numerics.levenberg import backend, fit_batch
-from btfref.representations.lafortune import lafortune_residual
-from btfref.representations.rf_lobes import fit_lobes, lobe_residual
+from btfref.representations.lafortune import lafortune_model
+from btfref.representations.rf_lobes import fit_lobes, lobe_model
 
 
 @pytest.fixture
@@ -20,17 +20,20 @@ def module(need):
 
 
 def decay(module, data):
-    """Residual of ``a exp(−b x)`` at x = 0, 0.1, …; ``data`` is (n_samples, N)."""
+    """Model ``a exp(−b x)`` at x = 0, 0.1, …; ``data`` is (n_samples, N)."""
     import drjit as dr
 
     flat, n = module.Float(np.ascontiguousarray(data, np.float32).ravel()), data.shape[1]
 
-    def residual(p, lane, sample):
-        x = 0.1 * module.Float(sample)
-        shape = dr.exp(-p[1] * x)
-        return p[0] * shape - dr.gather(module.Float, flat, sample * n + lane), [shape, -p[0] * x * shape]
+    def model(p, fit):
+        def samples(step):
+            x = 0.1 * module.Float(step)
+            shape = dr.exp(-p[1] * x)
+            return [(p[0] * shape - dr.gather(module.Float, flat, step * n + fit), [shape, x * shape])]
 
-    return residual
+        return samples, [module.Float(1), -p[0]]
+
+    return model
 
 
 def test_known_parameters_are_found(module, rng):
@@ -90,29 +93,34 @@ def doubles():
 def test_jacobians_are_those_of_differences(module, rng, model):
     views, lights = directions("10x5").vectors, directions("ubo81").vectors
     n = 40
+    kinds = doubles()
     if model == "lobes":
-        residual = lobe_residual(doubles(), np.zeros((len(lights), n), np.float32), lights, 2)
+        made, _ = lobe_model(kinds, np.zeros((n, len(lights)), np.float32), lights, 2)
         p = rng.uniform([-1, -1, 0, 0.1], [1, 1, 3, 2], (n, 2, 4)).reshape(n, -1)
     else:
-        factor = rng.uniform(0.5, 2, (len(views), n)) if "factor" in model else None
-        data = np.zeros((len(views), len(lights), n), np.float32)
-        residual = lafortune_residual(doubles(), data, views, lights, 2, factor)
+        factor = rng.uniform(0.5, 2, (n, len(views))) if "factor" in model else None
+        data = np.zeros((n, len(views), len(lights)), np.float32)
+        made = lafortune_model(kinds, data, views, lights, 2, factor)
         p = rng.uniform([-1, -1, -1, 0, 0.1], [1, 1, 1, 3, 2], (n, 2, 5)).reshape(n, -1)
         p = np.concatenate([rng.uniform(0, 1, (n, 1)), p], 1)
-    kinds = doubles()
-    lane, sample = kinds.UInt32(np.arange(n)), kinds.UInt32(rng.integers(0, len(lights), n))
+    fit, step = kinds.UInt32(np.arange(n)), kinds.UInt32(rng.integers(0, len(lights) // 4, n))
 
     def at(q):
-        r, row = residual([kinds.Float(np.ascontiguousarray(c)) for c in q.T], lane, sample)
-        return np.array(r), np.stack([np.array(c) + np.zeros(n) for c in row], 1)
+        samples, units = made([kinds.Float(np.ascontiguousarray(c)) for c in q.T], fit)
+        found = samples(step)
+        r = np.stack([np.array(r) for r, _ in found], 1)
+        row = [
+            [np.array(u * unit) + np.zeros(n) for u, unit in zip(row, units, strict=True)] for _, row in found
+        ]
+        return r, np.moveaxis(np.array(row), 0, 2)
 
     _, row = at(p)
-    step = 1e-6
+    size = 1e-6
     for k in range(p.shape[1]):
-        shift = step * (np.arange(p.shape[1]) == k)
-        difference = (at(p + shift)[0] - at(p - shift)[0]) / (2 * step)
-        scale = np.maximum(np.abs(row[:, k]), 1)
-        assert (np.abs(difference - row[:, k]) <= tolerance("levenberg.jacobian.max") * scale).all()
+        shift = size * (np.arange(p.shape[1]) == k)
+        difference = (at(p + shift)[0] - at(p - shift)[0]) / (2 * size)
+        scale = np.maximum(np.abs(row[k]), 1)
+        assert (np.abs(difference - row[k]) <= tolerance("levenberg.jacobian.max") * scale).all()
 
 
 def test_lobes_are_no_worse_than_scipy_s(module):
@@ -121,7 +129,7 @@ def test_lobes_are_no_worse_than_scipy_s(module):
     from btfref.representations.lobe_start import exponent_limit, lobe_starts
 
     lights = directions("ubo81")
-    data = oracle_values((6, 5), lights, lights)[20].mean(-1).reshape(81, -1).astype(np.float32)
+    data = oracle_values((6, 5), lights, lights)[20].mean(-1).reshape(81, -1).T.astype(np.float32)
     result = fit_lobes(data, lights, 2)
     starts = lobe_starts(data, lights.vectors, 2)
     assert result.converged.all()
@@ -132,11 +140,11 @@ def test_lobes_are_no_worse_than_scipy_s(module):
         return (peak * np.maximum(lights.vectors @ axis, 1e-9) ** np.exp(log_n)).sum(-1)
 
     ours = theirs = 0.0
-    for i in range(data.shape[1]):
-        top = max(4 * data[:, i].max(), 1e-6)
+    for i in range(len(data)):
+        top = max(4 * data[i].max(), 1e-6)
         upper = np.tile([1.5, 1.5, np.log(exponent_limit(lights)), top], 2)
         lower = np.tile([-1.5, -1.5, 0, 0], 2)
         start = np.clip(starts[i], lower + 1e-6, upper - 1e-6)
-        peer = least_squares(lambda p, i=i: model(p) - data[:, i], start, bounds=(lower, upper))
+        peer = least_squares(lambda p, i=i: model(p) - data[i], start, bounds=(lower, upper))
         ours, theirs = ours + result.cost[i], theirs + peer.cost
     assert ours <= theirs * (1 + tolerance("levenberg.lobes.cost"))
