@@ -1,4 +1,10 @@
-"""The gathering loop of the shared estimator: entries of each texel, lights, sums and their spread."""
+"""The gathering loop of the shared estimator: entries of each texel, lights, sums and their spread.
+
+A texel's mean is made of two independent halves. With Y_h = Σ w L over a half's entries, W_h = Σ w whose
+expectation is exactly 1, and R_h = Y_h / W_h, half h is corrected by what the other one says of the slope:
+``Y_h − R_(1−h) (W_h − 1)``. No half's slope depends on its own points, so the mean is free of bias, and it is
+about as quiet as the ratio Σ w L / Σ w. It equals ``½ [R_0 (1 + W_0 − W_1) + R_1 (1 + W_1 − W_0)]``.
+"""
 
 from __future__ import annotations
 
@@ -7,164 +13,210 @@ import numpy as np
 #: Lights that one lane serves.
 LIGHTS_PER_LANE = 3
 
+#: Bound of the correction n / (n − 1) of the variance for n entries, n counted by weight.
+LEAST_FREEDOM = 4
 
-def gather_view(surface, lobes, table, lights, bins, w_view, *, radiance, place, per_texel, photons, texels):
-    """Mean and variance of the mean of one view.
+
+def gather(scene, surface, table, rows, bins, *, radiance, splats, texels):
+    """Means and variances of the mean of several views.
 
     Parameters
     ----------
+    scene : SurfaceScene
     surface : Surface
-    lobes : BroadLobes
     table : mitsuba.Float
-        Per point and light: light by way of the broad lobe (3 numbers) and visibility.
-    lights : mitsuba.Float
-        Vectors, flat.
-    bins : Bins
-    w_view : ndarray (3,)
+        Per record and light: light by way of the broad lobe (3 numbers) and visibility.
+    rows : sequence of int
+        Numbers of the views' directions.
+    bins : list of Bins
+        One per view.
     radiance : mitsuba.Float
-        Light by way of the rest, [view, sample, texel, light, 3].
-    place : int
-        This view's place in it.
-    per_texel : int
-        Samples in it; already divided by their number.
-    photons : tuple of ndarray (texels · lights, 3), or None
-        Sums and sums of squares.
+        Light by way of the rest, [view, half, texel, light, 3].
+    splats : tuple of mitsuba.Float, or None
+        Sums and sums of squares of photons, [view, texel, light, 3].
     texels : tuple of int
 
     Returns
     -------
-    mean, variance : ndarray (lights, texels, 3) float32
+    mean, variance : ndarray (views, lights, texels, 3) float32
 
     Notes
     -----
-    Variance of the ratio Σ w L / Σ w by successive differences along the curve on which the points are
-    stratified (Wolter 2007, *Introduction to Variance Estimation*, sec. 8.2): neighbours share almost all
-    that does not vary inside a stratum. Of one walk per texel no spread is known; differences to the four
-    neighbouring texels stand for it. Photons are counted as a compound Poisson sum.
+    Variance of the points: pairs of a stratum are independent, so their squared differences are an unbiased
+    estimate for any fixed slope (Wolter 2007, *Introduction to Variance Estimation*, sec. 2.2); a partner
+    outside the texel counts as 0. Variance of the walks: the halves' squared difference, averaged over two by
+    two texels. Photons are counted as a compound Poisson sum.
     """
     import drjit as dr
     import mitsuba as mi
 
-    n_texels, n_lit = texels[0] * texels[1], dr.width(lights) // 3
-    block = LIGHTS_PER_LANE
-    n_blocks = -(-n_lit // block)
-    # Everything that depends on the entry alone, once.
-    point = mi.UInt32(bins.point)
-    if len(bins.point) == 0:
-        zero = np.zeros((n_lit, n_texels, 3), np.float32)
-        return zero, zero.copy()
-    w = mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in w_view))
-    number = dr.gather(mi.UInt32, surface.number, point)
-    shading, s = (dr.gather(mi.Vector3f, a, point) for a in (surface.shading, surface.s))
-    frame = mi.Frame3f(s, dr.cross(shading, s), mi.Normal3f(shading))
-    wi = frame.to_local(w)
-    uv = dr.gather(mi.Point2f, surface.uv, point)
-    packets = dr.zeros(mi.Float, 16 * len(bins.point))
-    lane = dr.arange(mi.UInt32, len(bins.point))
-    values = (*s, uv.x, *shading, uv.y, *wi, lobes.shape(number, wi.z), mi.Float(bins.weight))
-    for k, value in enumerate(values):
-        dr.scatter(packets, value, lane * 16 + k)
-    dr.scatter(packets, dr.reinterpret_array(mi.Float, number), lane * 16 + 13)
-    dr.scatter(packets, dr.reinterpret_array(mi.Float, point), lane * 16 + 14)
-    dr.eval(packets)
+    n_texels, n_lit = texels[0] * texels[1], scene.lights.count
+    shape = (len(rows), n_lit, n_texels, 3)
+    points, spread = _points(scene, surface, table, rows, bins, n_texels)
+    n_blocks = -(-n_lit // LIGHTS_PER_LANE)
+    halves = np.stack([some.totals() for some in bins])  # view, half, texel
+    lean = 0.5 * (halves[:, 0] - halves[:, 1])
+    share = mi.Float((0.5 + lean).astype(np.float32).ravel())
 
-    lane = dr.arange(mi.UInt32, n_texels * n_blocks)
-    texel, first = lane // n_blocks, (lane % n_blocks) * block
-    start = mi.UInt32(bins.start)
-    entry, end = dr.gather(mi.UInt32, start, texel), dr.gather(mi.UInt32, start, texel + 1)
-    count = end - entry
-    index = [dr.minimum(first + j, n_lit - 1) for j in range(block)]
-    vectors = [dr.gather(mi.Vector3f, lights, i) for i in index]
-    light_count = dr.opaque(mi.UInt32, n_lit)
-
-    def step(entry, total, weights, last_w, last, dd, dx, dw, sums):
-        e = [dr.gather(mi.Array4f, packets, entry * 4 + k) for k in range(4)]
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(lane))
-        shading = mi.Vector3f(e[1].x, e[1].y, e[1].z)
-        s = mi.Vector3f(e[0].x, e[0].y, e[0].z)
-        si.sh_frame = mi.Frame3f(s, dr.cross(shading, s), mi.Normal3f(shading))
-        si.n = si.sh_frame.n
-        si.uv = mi.Point2f(e[0].w, e[1].w)
-        si.wi = mi.Vector3f(e[2].x, e[2].y, e[2].z)
-        weight, shape = e[3].x, e[2].w
-        bsdf = dr.reinterpret_array(mi.BSDFPtr, dr.reinterpret_array(mi.UInt32, e[3].y))
-        point = dr.reinterpret_array(mi.UInt32, e[3].z)
-        step_w = weight - last_w
-        sums, last, dd, dx = list(sums), list(last), list(dd), list(dx)
-        begun = total > 0
-        for j in range(block):
-            row = dr.gather(mi.Array4f, table, dr.fma(point, light_count, index[j]))
-            lit = row.w > 0
-            value = bsdf.eval(lobes.full, si, si.to_local(vectors[j]), lit)
-            value = weight * dr.fma(mi.Color3f(row.x, row.y, row.z), shape, dr.select(lit, value, 0))
-            change = dr.select(begun, value - last[j], 0)
-            dd[j] = dr.fma(change, change, dd[j])
-            dx[j] = dr.fma(change, step_w, dx[j])
-            last[j] = value
-            sums[j] = sums[j] + value
-        dw = dw + dr.select(begun, dr.square(step_w), 0)
-        return (
-            entry + 1,
-            total + 1,
-            weights + weight,
-            weight,
-            tuple(last),
-            tuple(dd),
-            tuple(dx),
-            dw,
-            tuple(sums),
-        )
-
-    zero = dr.zeros(mi.Float, dr.width(lane))
-    colours = tuple(mi.Color3f(zero) for _ in range(block))
-    state = (entry, zero + 0, zero + 0, zero + 0, colours, colours, colours, zero + 0, colours)
-    state = dr.while_loop(state, lambda entry, *_: entry < end, step)
-    _, _, weights, _, _, dd, dx, dw, sums = state
-    inverse = dr.select(weights > 0, 1 / weights, 0)
-    n = mi.Float(count)
-    # n/(n−1) differences, each of twice the variance, of a sum of n.
-    scale = dr.select(count > 1, n / (2 * (n - 1)), 0) * dr.square(inverse)
-    means = [sums[j] * inverse for j in range(block)]
-    spread = [
-        dr.maximum(dd[j] - 2 * means[j] * dx[j] + dr.square(means[j]) * dw, 0) * scale for j in range(block)
-    ]
-    # Tin's ratio estimator (1965): the ratio's bias of order 1/n, from the same differences, is taken off.
-    means = [means[j] + scale * (dx[j] - means[j] * dw) for j in range(block)]
-    dr.eval(means, spread)
-
-    mean, variance = (dr.zeros(mi.Float, n_lit * n_texels * 3) for _ in range(2))
-    rows, columns = texels
-    row, column = texel // columns, texel % columns
-    neighbours = [
-        row * columns + (column + 1) % columns,
-        row * columns + (column + columns - 1) % columns,
-        ((row + 1) % rows) * columns + column,
-        ((row + rows - 1) % rows) * columns + column,
-    ]
-    base = dr.opaque(mi.UInt32, place * per_texel * n_texels)
-    splats = None if photons is None else [mi.Float(part.ravel()) for part in photons]
-    for j in range(block):
-        inside = first + j < n_lit
-        value, noise = means[j], spread[j]
-
-        def walks(texel, j=j):
-            total = mi.Color3f(0)
-            for k in range(per_texel):
-                at = (base + k * n_texels + texel) * n_lit + index[j]
-                total += dr.gather(mi.Color3f, radiance, at)
-            return total
-
-        own = walks(texel)
-        noise = noise + sum(dr.square(own - walks(other)) for other in neighbours) / 8
-        value = value + own
+    lane = dr.arange(mi.UInt32, len(rows) * n_texels * n_blocks)
+    cell, first = lane // n_blocks, (lane % n_blocks) * LIGHTS_PER_LANE
+    view, texel = cell // n_texels, cell % n_texels
+    mean, variance = (dr.zeros(mi.Float, int(np.prod(shape))) for _ in range(2))
+    mine = dr.gather(mi.Float, share, cell)
+    if radiance is not None:
+        pooled = _pooled(radiance, len(rows), texels, n_lit)
+        block = (texel // texels[1] // 2) * ((texels[1] + 1) // 2) + texel % texels[1] // 2
+        block += view * (((texels[0] + 1) // 2) * ((texels[1] + 1) // 2))
+    for j in range(LIGHTS_PER_LANE):
+        light = first + j
+        inside = light < n_lit
+        value, noise = points[j], spread[j]
+        if radiance is not None:
+            at = (2 * view * n_texels + texel) * n_lit + light
+            one = dr.gather(mi.Color3f, radiance, at, inside)
+            other = dr.gather(mi.Color3f, radiance, at + n_texels * n_lit, inside)
+            value += mine * one + (1 - mine) * other
+            # The halves' shares are mine and 1 − mine, the pooled number is for ½ and ½.
+            scale = 2 * (dr.square(mine) + dr.square(1 - mine))
+            noise += scale * dr.gather(mi.Color3f, pooled, block * n_lit + light, inside)
         if splats is not None:
-            at = texel * n_lit + index[j]
-            value += dr.gather(mi.Color3f, splats[0], at)
-            noise += dr.gather(mi.Color3f, splats[1], at)
-        at = (index[j] * n_texels + texel) * 3
+            at = cell * n_lit + light
+            value += dr.gather(mi.Color3f, splats[0], at, inside)
+            noise += dr.gather(mi.Color3f, splats[1], at, inside)
+        at = ((view * n_lit + light) * n_texels + texel) * 3
         for channel in range(3):
             dr.scatter(mean, value[channel], at + channel, inside)
             dr.scatter(variance, noise[channel], at + channel, inside)
     dr.eval(mean, variance)
-    shape = (n_lit, n_texels, 3)
     return mean.numpy().reshape(shape), variance.numpy().reshape(shape)
+
+
+def _pooled(radiance, n_views, texels, n_lit):
+    """Variance of the halves' mean over two by two texels: [view, block, light, 3]."""
+    import drjit as dr
+    import mitsuba as mi
+
+    rows, columns = texels
+    n_texels, wide, high = rows * columns, (columns + 1) // 2, (rows + 1) // 2
+    lane = dr.arange(mi.UInt32, n_views * high * wide * n_lit)
+    light, block = lane % n_lit, lane // n_lit
+    view, y, x = block // (high * wide), block // wide % high, block % wide
+    total = mi.Color3f(0)
+    for dy in range(2):
+        for dx in range(2):
+            texel = dr.minimum(2 * y + dy, rows - 1) * columns + dr.minimum(2 * x + dx, columns - 1)
+            at = (2 * view * n_texels + texel) * n_lit + light
+            one = dr.gather(mi.Color3f, radiance, at)
+            total += dr.square(one - dr.gather(mi.Color3f, radiance, at + n_texels * n_lit))
+    result = dr.zeros(mi.Float, 3 * dr.width(lane))
+    for channel in range(3):
+        dr.scatter(result, total[channel] / 16, 3 * lane + channel)
+    dr.eval(result)
+    return result
+
+
+def _packets(scene, surface, rows, bins):
+    """What the loop needs to know of an entry, 16 numbers each: computed once, not once per light."""
+    import drjit as dr
+    import mitsuba as mi
+
+    record = mi.UInt32(np.concatenate([some.record for some in bins]))
+    row = np.repeat(np.asarray(rows, np.uint32), [len(some.record) for some in bins])
+    w = dr.gather(mi.Vector3f, scene.cache.vectors, mi.UInt32(row))
+    number = dr.gather(mi.UInt32, surface.number, record)
+    shading, s = (dr.gather(mi.Vector3f, a, record) for a in (surface.shading, surface.s))
+    wi = mi.Frame3f(s, dr.cross(shading, s), mi.Normal3f(shading)).to_local(w)
+    uv = dr.gather(mi.Point2f, surface.uv, record)
+    weight, half = (np.concatenate([getattr(some, name) for some in bins]) for name in ("weight", "half"))
+    lane = dr.arange(mi.UInt32, len(weight))
+    packets = dr.zeros(mi.Float, 16 * len(weight))
+    whole = (mi.Float(dr.reinterpret_array(mi.Float, a)) for a in (number, record))
+    numbers, records = whole
+    values = (
+        *s, uv.x, *shading, uv.y, *wi, scene.lobes.shape(number, wi.z),
+        mi.Float(weight), numbers, records, mi.Float(half.astype(np.float32)),
+    )  # fmt: skip
+    for k, value in enumerate(values):
+        dr.scatter(packets, value, lane * 16 + k)
+    dr.eval(packets)
+    return packets
+
+
+def _points(scene, surface, table, rows, bins, n_texels):
+    """Mean and its variance from the entries: per light of a lane's block one colour each."""
+    import drjit as dr
+    import mitsuba as mi
+
+    lights, lobes, block = scene.lights, scene.lobes, LIGHTS_PER_LANE
+    n_lit = lights.count
+    n_blocks = -(-n_lit // block)
+    lane = dr.arange(mi.UInt32, len(rows) * n_texels * n_blocks)
+    cell, first = lane // n_blocks, (lane % n_blocks) * block
+    offsets = np.cumsum([0, *(len(some.record) for some in bins)])
+    starts = np.concatenate([some.start[:-1] + np.uint32(k) for some, k in zip(bins, offsets, strict=False)])
+    start = mi.UInt32(np.append(starts, offsets[-1]).astype(np.uint32))
+    begin, end = dr.gather(mi.UInt32, start, cell), dr.gather(mi.UInt32, start, cell + 1)
+    zero = dr.zeros(mi.Float, dr.width(lane))
+    if offsets[-1] == 0:
+        return [[mi.Color3f(zero) for _ in range(block)] for _ in range(2)]
+    packets = _packets(scene, surface, rows, bins)
+    index = [dr.minimum(first + j, n_lit - 1) for j in range(block)]
+    vectors = [dr.gather(mi.Vector3f, lights.vectors, i) for i in index]
+    light_count = dr.opaque(mi.UInt32, n_lit)
+
+    def step(entry, weights, squares, last_w, last_pair, last, dd, dx, dw, sums):
+        e = [dr.gather(mi.Array4f, packets, entry * 4 + k) for k in range(4)]
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(lane))
+        shading, s = mi.Vector3f(e[1].x, e[1].y, e[1].z), mi.Vector3f(e[0].x, e[0].y, e[0].z)
+        si.sh_frame = mi.Frame3f(s, dr.cross(shading, s), mi.Normal3f(shading))
+        si.n = si.sh_frame.n
+        si.uv = mi.Point2f(e[0].w, e[1].w)
+        si.wi = mi.Vector3f(e[2].x, e[2].y, e[2].z)
+        weight, shape, odd = e[3].x, e[2].w, e[3].w > 0
+        bsdf = dr.reinterpret_array(mi.BSDFPtr, dr.reinterpret_array(mi.UInt32, e[3].y))
+        record = dr.reinterpret_array(mi.UInt32, e[3].z)
+        # The partner of the same stratum comes just before; alone in the texel, an entry differs from 0.
+        pair = record >> 1
+        together = pair == last_pair
+        row = [dr.gather(mi.Array4f, table, dr.fma(record, light_count, i)) for i in index]
+        lit = [one.w != 0 for one in row]
+        last, dd, dx, sums = list(last), list(dd), list(dx), list(sums)
+        kept_w = dr.select(together, last_w, 0)
+        for j in range(block):
+            broad = mi.Color3f(row[j].x, row[j].y, row[j].z)
+            direct = bsdf.eval(lobes.full, si, si.to_local(vectors[j]), lit[j])
+            value = weight * dr.fma(broad, shape, dr.select(lit[j], direct * row[j].w, 0))
+            kept = dr.select(together, last[j], 0)
+            dd[j] = dr.fma(value, value - 2 * kept, dd[j])
+            dx[j] = dr.fma(value, weight - kept_w, dr.fma(-kept, weight, dx[j]))
+            last[j] = value
+            sums[j] = sums[j] + dr.select(odd, 0, value)
+            sums[block + j] = sums[block + j] + dr.select(odd, value, 0)
+        dw = dr.fma(weight, weight - 2 * kept_w, dw)
+        split = (dr.select(odd, 0, weight), dr.select(odd, weight, 0))
+        weights = tuple(a + b for a, b in zip(weights, split, strict=True))
+        squares = tuple(dr.fma(b, b, a) for a, b in zip(squares, split, strict=True))
+        return entry + 1, weights, squares, weight, pair, tuple(last), tuple(dd), tuple(dx), dw, tuple(sums)
+
+    colours = tuple(mi.Color3f(zero) for _ in range(block))
+    nothing = dr.full(mi.UInt32, 0xFFFFFFFF, dr.width(lane))
+    state = (
+        begin, (zero, zero), (zero, zero), zero, nothing, colours, colours, colours, zero, (*colours, *colours)
+    )  # fmt: skip
+    state = dr.while_loop(state, lambda entry, *_: entry < end, step)
+    _, (one, two), squares, _, _, _, dd, dx, dw, sums = state
+    inverse = dr.select(one + two > 0, dr.rcp(one + two), 0)
+    shares = [dr.select(a > 0, (0.5 + 0.5 * (a - b)) / a, 0) for a, b in ((one, two), (two, one))]
+    # Variance of the entries' sum with the halves' shares, and what the slope takes of the degrees of freedom.
+    both = squares[0] + squares[1]
+    scale = dr.fma(squares[0], dr.square(shares[0]), squares[1] * dr.square(shares[1]))
+    scale *= dr.select(both > 0, dr.rcp(both), 0) / dr.maximum(
+        1 - both * dr.square(inverse), 1 / LEAST_FREEDOM
+    )
+    means = [shares[0] * sums[j] + shares[1] * sums[block + j] for j in range(block)]
+    slopes = [(sums[j] + sums[block + j]) * inverse for j in range(block)]
+    spread = [
+        scale * dr.maximum(dd[j] - 2 * slopes[j] * dx[j] + dr.square(slopes[j]) * dw, 0) for j in range(block)
+    ]
+    dr.eval(means, spread)
+    return means, spread

@@ -59,8 +59,7 @@ class Surface:
         import drjit as dr
         import mitsuba as mi
 
-        number = dr.reinterpret_array(mi.UInt32, hit.bsdf())
-        number = dr.select(hit.is_valid(), number, 0)
+        number = dr.select(hit.is_valid(), dr.reinterpret_array(mi.UInt32, hit.bsdf()), 0)
         place = cls(
             mi.Point3f(hit.p),
             mi.Vector3f(hit.n),
@@ -120,7 +119,7 @@ class Surface:
         return si, dr.reinterpret_array(mi.BSDFPtr, number), number, albedo
 
 
-def visibility(tiles, surface, directions, *, front_only=False, towards=None, through=False):
+def visibility(tiles, surface, directions, *, front_only=False):
     """Which directions the records see.
 
     Parameters
@@ -130,10 +129,6 @@ def visibility(tiles, surface, directions, *, front_only=False, towards=None, th
     directions : ndarray (n, 3)
     front_only : bool
         Leave out what lies behind the surface.
-    towards : mitsuba.Vector3f, optional
-        Where light came from: leave out what reflection from there cannot reach.
-    through : mitsuba.Bool
-        Where the BSDF transmits, so that nothing may be left out.
 
     Returns
     -------
@@ -149,15 +144,10 @@ def visibility(tiles, surface, directions, *, front_only=False, towards=None, th
     lane = dr.arange(mi.UInt32, n_records)
     si = dr.zeros(mi.SurfaceInteraction3f, n_records)
     si.p, si.n = surface.p, mi.Normal3f(surface.n)
-    side = None if towards is None else dr.dot(surface.shading, towards)
 
     def look(i):
         w = dr.gather(mi.Vector3f, vectors, i)
-        active = mi.Bool(True)
-        if front_only:
-            active &= dr.dot(si.n, w) > 0
-        if side is not None:
-            active &= through | (side * dr.dot(surface.shading, w) > 0)
+        active = dr.dot(si.n, w) > 0 if front_only else mi.Bool(True)
         free = active & ~tiles.occluded(si.spawn_ray(w), active)
         dr.scatter(result, mi.UInt8(dr.select(free, mi.UInt32(1), mi.UInt32(0))), dr.fma(i, records, lane))
         return (i + 1,)
@@ -166,31 +156,61 @@ def visibility(tiles, surface, directions, *, front_only=False, towards=None, th
     return result.numpy().reshape(n_directions, n_records)
 
 
-def connect(lobes, lights, target, si, bsdf, number, albedo, weight, offset, sees, *, stride, broad=False):
+@dataclass
+class Lights:
+    """Directions of the lights, and the numbers of those directions.
+
+    Attributes
+    ----------
+    vectors : mitsuba.Float
+        Flat.
+    rows : mitsuba.UInt32
+    """
+
+    vectors: Any
+    rows: Any
+
+    @property
+    def count(self):
+        """Number of lights."""
+        import drjit as dr
+
+        return dr.width(self.rows)
+
+
+def connect(lobes, lights, target, vertex, offset, sees, *, stride, broad=False):
     """Add weight · BSDF · cosine · visibility of all lights to ``target``.
 
     Parameters
     ----------
+    lights : Lights
+    target : mitsuba.Float
+    vertex : tuple
+        Surface interactions with ``wi``, BSDF pointers, their numbers, ρ (or None) and weight.
+    offset : mitsuba.UInt32
+        Where in ``target`` a lane's first light goes; each ``stride`` further.
     sees : callable
-        ``sees(light, w_light) -> mitsuba.Bool``; asked last.
+        ``sees(row) -> mitsuba.Float``, the visibility along a direction.
     broad : bool
         Only the broad lobe.
     """
     import drjit as dr
     import mitsuba as mi
 
-    count = dr.opaque(mi.UInt32, dr.width(lights) // 3)
+    si, bsdf, number, albedo, weight = vertex
+    count = dr.opaque(mi.UInt32, lights.count)
 
     def step(i):
-        w = dr.gather(mi.Vector3f, lights, i)
+        w = dr.gather(mi.Vector3f, lights.vectors, i)
+        seen = sees(dr.gather(mi.UInt32, lights.rows, i))
+        lit = seen != 0
         local = si.to_local(w)
         if broad:
             value = lobes.value(number, albedo, si.wi, local)
         else:
-            value = bsdf.eval(lobes.full, si, local)
-        value = weight * value
-        lit = dr.max(dr.abs(value)) > 0
-        lit &= sees(i, lit)
+            value = bsdf.eval(lobes.full, si, local, lit)
+        value = weight * value * seen
+        lit &= dr.max(dr.abs(value)) > 0
         at = dr.fma(i, stride, offset)
         for channel in range(3):
             # Each lane owns its entries: no atomics, and the same bytes every time.
@@ -201,11 +221,13 @@ def connect(lobes, lights, target, si, bsdf, number, albedo, weight, offset, see
     dr.eval(target)
 
 
-def continue_walks(tiles, lobes, lights, target, state, keys, *, vertex, last, stride, broad_first):
+def continue_walks(tiles, lobes, cache, lights, target, state, keys, *, vertex, last, stride, broad_first):
     """Follow walks from their first ray to the last vertex, connecting each vertex to all lights.
 
     Parameters
     ----------
+    cache : VisibilityCache
+    lights : Lights
     state : dict
         ``lane``, ``target`` (offset), ``origin``, ``direction``, ``weight``.
     vertex, last : int
@@ -226,21 +248,24 @@ def continue_walks(tiles, lobes, lights, target, state, keys, *, vertex, last, s
         if dr.width(index) == 0:
             return
         lane, offset, origin, direction, weight = (dr.gather(type(a), a, index) for a in values)
-        hit = tiles.intersect(origin, direction)
+        hit, place = tiles.locate(origin, direction)
         reached = hit.is_valid()
-        dr.eval(hit, reached, lane, offset, direction, weight)
+        number = dr.select(reached, dr.reinterpret_array(mi.UInt32, hit.bsdf()), 0)
+        row = cache.row(place, number)
+        dr.eval(hit, row, reached, lane, offset, direction, weight)
         index = dr.compress(reached)
         if dr.width(index) == 0:
             return
         si = dr.gather(type(hit), hit, index)
-        lane, offset, weight = (dr.gather(type(a), a, index) for a in (lane, offset, weight))
+        lane, offset, weight, row, direction = (
+            dr.gather(type(a), a, index) for a in (lane, offset, weight, row, direction)
+        )
         bsdf = si.bsdf()
         number = dr.reinterpret_array(mi.UInt32, bsdf)
         depth = dr.opaque(mi.UInt32, 2 * vertex)
-        lobe, u, v, roulette = uniforms(lane, keys, depth)
-        roulette, _, _, _ = uniforms(lane, keys, depth + 1)
-        follow = vertex < last
-        if follow:
+        lobe, u, v, _ = uniforms(lane, keys, depth)
+        roulette, choice, _, _ = uniforms(lane, keys, depth + 1)
+        if vertex < last:
             sample, gain = bsdf.sample(lobes.full, si, lobe, mi.Point2f(u, v))
             onward = weight * gain
             survival = dr.minimum(dr.max(dr.abs(onward)), ROULETTE_LIMIT)
@@ -250,24 +275,23 @@ def continue_walks(tiles, lobes, lights, target, state, keys, *, vertex, last, s
             ray = si.spawn_ray(si.to_world(sample.wo))
             values = [lane, offset, mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Color3f(onward)]
             dr.eval(values, alive)
-        albedo = lobes.albedo(bsdf, number, si) if first and broad_first else None
+        broad = first and broad_first
+        albedo = lobes.albedo(bsdf, number, si) if broad else None
+        coded = cache.sights(tiles, si, row, choice, towards=-direction)
+        n, at = dr.opaque(mi.UInt32, cache.n), dr.arange(mi.UInt32, dr.width(lane))
 
-        def sees(i, lit, si=si):
-            return ~tiles.occluded(si.spawn_ray(dr.gather(mi.Vector3f, lights, i)), lit)
+        def sees(k, coded=coded, n=n, at=at):
+            return cache.value(dr.gather(mi.UInt8, coded, dr.fma(at, n, k)))
 
         connect(
             lobes,
             lights,
             target,
-            si,
-            bsdf,
-            number,
-            albedo,
-            weight,
+            (si, bsdf, number, albedo, weight),
             offset,
             sees,
             stride=stride,
-            broad=first and broad_first,
+            broad=broad,
         )
         first = False
         vertex += 1

@@ -82,6 +82,10 @@ class TiledScene:
         -------
         mitsuba.SurfaceInteraction3f
         """
+        return self.locate(origin, direction)[0]
+
+    def locate(self, origin, direction):
+        """As `intersect`, and the preliminary intersection, which knows the triangle."""
         import drjit as dr
         import mitsuba as mi
 
@@ -108,7 +112,7 @@ class TiledScene:
         )
         p = interaction.p
         interaction.p = mi.Point3f(p.x - dr.floor(p.x), p.y - dr.floor(p.y), p.z)
-        return interaction
+        return interaction, hit
 
     def occluded(self, ray, active):
         """Whether the infinitely tiled surface blocks rays that start in the central tile.

@@ -14,12 +14,20 @@ def patch(mi, mesostructure, reach):
         properties = mi.Properties()
         properties["material"] = mi.load_dict(part.bsdf)
         mesh = mi.Mesh(
-            f"material_{index}", len(vertices), len(faces), has_vertex_normals=True, props=properties
+            f"material_{index}",
+            len(vertices),
+            len(faces),
+            has_vertex_normals=True,
+            has_vertex_texcoords=part.uv is not None,
+            props=properties,
         )
         values = mi.traverse(mesh)
         values["vertex_positions"] = vertices.astype(np.float32).ravel()
         values["vertex_normals"] = np.tile(part.normals, (len(offsets), 1)).astype(np.float32).ravel()
         values["faces"] = faces.astype(np.uint32).ravel()
+        if part.uv is not None:
+            # Fibres run along u: without it an anisotropic BSDF is turned any way.
+            values["vertex_texcoords"] = np.tile(part.uv, (len(offsets), 1)).astype(np.float32).ravel()
         values.update()
         shapes[f"material_{index}"] = mesh
     return shapes
