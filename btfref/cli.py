@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import keyword
 import os
 import sys
 
@@ -50,7 +51,8 @@ def build_parser():
     parser.add_argument("--version", action="version", version=f"btfref {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name in COMMANDS:
-        module = importlib.import_module(f"btfref.commands.{name}")
+        # A module cannot carry the name of a keyword: the command `import` is in import_.py.
+        module = importlib.import_module(f"btfref.commands.{name}{'_' * keyword.iskeyword(name)}")
         summary = module.__doc__.splitlines()[0].rstrip(".")
         command = commands.add_parser(
             name,

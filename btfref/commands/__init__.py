@@ -4,4 +4,16 @@ A module has a docstring (its first line is the help line), ``add_arguments(pars
 returns the exit status. Modules import the library inside ``run``, so that ``btfref --help`` stays quick.
 """
 
-COMMANDS = ("doctor", "demo", "synth", "fit", "info", "render", "realtime", "compare", "bench")
+COMMANDS = (
+    "doctor",
+    "demo",
+    "synth",
+    "import",
+    "export",
+    "fit",
+    "info",
+    "render",
+    "realtime",
+    "compare",
+    "bench",
+)

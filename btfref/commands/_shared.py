@@ -81,6 +81,21 @@ def count(minimum=1):
     return read
 
 
+def number_above(minimum):
+    """A reader of finite numbers greater than `minimum`, for argparse's ``type=``."""
+
+    def read(text):
+        try:
+            found = float(text)
+        except ValueError:
+            found = None
+        if found is None or not minimum < found < float("inf"):
+            raise ArgumentTypeError(f"got {text!r}, expected a number > {minimum}")
+        return found
+
+    return read
+
+
 def ranges(text):
     """Whole numbers such as ``0,3,10-12`` as a tuple, for argparse's ``type=``."""
     found = []

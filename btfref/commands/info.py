@@ -1,4 +1,4 @@
-"""Say what a representation, a sampled BTF or an image holds, from its headers only."""
+"""Say what a representation, a sampled or measured BTF or an image holds, from its headers only."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _BYTES = ("payload_bytes", "file_bytes", "raw_bytes")
 def add_arguments(parser):
     """Describe the command's arguments."""
     parser.add_argument(
-        "file", metavar="FILE", help="representation (.exr), sampled BTF (.btf.zarr), or image"
+        "file", metavar="FILE", help="representation (.exr), sampled BTF (.btf.zarr), measured BTF, or image"
     )
     parser.add_argument("--json", action="store_true", help="print the facts as JSON")
 
@@ -46,14 +46,31 @@ def read(path):
     if path.is_dir():
         from btfref.sampling import open_store
 
-        return open_store(path).info()
+        if (path / "zarr.json").exists() or path.name.endswith(".zarr") or not (measured := _measured(path)):
+            return open_store(path).info()
+        return measured
     if path.suffix.lower() == ".png":
         return _png(path)
     if path.suffix.lower() == ".exr" and _plain_exr(path):
         return _exr(path)
+    if path.is_file() and path.suffix.lower() != ".exr" and (measured := _measured(path)):
+        return measured
     from btfref.representations.container import read_info
 
     return read_info(path)
+
+
+def _measured(path):
+    """Facts about a measured BTF in a format of others, or None when it is none; missing images are counted."""
+    from btfref.formats import format_named, identify, open_source
+
+    if path.is_file() and path.stat().st_size == 0:
+        return None
+    name = identify(path)
+    if name is None:
+        return None
+    missing = {"allow_missing": True} if "allow_missing" in format_named(name).options else {}
+    return open_source(path, format=name, **missing).info()
 
 
 def _headers(path):

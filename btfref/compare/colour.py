@@ -6,25 +6,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: Luminance of linear Rec. 709 (ITU-R BT.709-6, item 3.2).
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+from btfref.numerics.colour import LUMINANCE, RGB_TO_XYZ, decode_srgb, encode_srgb
 
-
-def _rgb_to_xyz():
-    """Matrix from the chromaticities of the primaries and of D65 (ITU-R BT.709-6, item 1.3 and 1.4)."""
-    xy = np.array([[0.64, 0.33], [0.30, 0.60], [0.15, 0.06]])
-    white = np.array([0.3127, 0.3290])
-
-    def lift(chromaticity):
-        x, y = chromaticity[..., 0], chromaticity[..., 1]
-        return np.stack([x / y, np.ones_like(x), (1 - x - y) / y], axis=-1)
-
-    primaries = lift(xy).T
-    return primaries * np.linalg.solve(primaries, lift(white))
-
-
-#: Columns: XYZ of the three primaries; white has Y = 1.
-RGB_TO_XYZ = _rgb_to_xyz()
+__all__ = [
+    "LUMINANCE",
+    "RGB_TO_XYZ",
+    "Display",
+    "ciede2000",
+    "decode_srgb",
+    "delta_e00",
+    "encode_srgb",
+    "fit_display",
+    "lab",
+]
 
 
 @dataclass(frozen=True)
@@ -73,18 +67,6 @@ def fit_display(reference, mask=None):
     if lit.size == 0:
         return Display(0.0)
     return Display(float(np.round(4 * np.log2(0.9 / np.percentile(lit, 99))) / 4))
-
-
-def encode_srgb(linear):
-    """The sRGB encoding of linear values in [0, 1] (IEC 61966-2-1), float64, same shape."""
-    x = np.asarray(linear, np.float64)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055)
-
-
-def decode_srgb(encoded):
-    """Linear values of sRGB-encoded values in [0, 1] (IEC 61966-2-1), float64, same shape."""
-    x = np.asarray(encoded, np.float64)
-    return np.where(x <= 0.04045, x / 12.92, ((np.maximum(x, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
 def lab(rgb):

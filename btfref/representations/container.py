@@ -50,7 +50,7 @@ def save(representation, path):
         "arrays": {name: {"shape": list(a.shape), "dtype": a.dtype.name} for name, a in arrays.items()},
     }
     images = {
-        name: array.reshape(*_image_size(array.shape), array.shape[-1]) for name, array in arrays.items()
+        name: array.reshape(*image_size(array.shape), array.shape[-1]) for name, array in arrays.items()
     }
     display = (
         np.zeros(2, np.int32),
@@ -191,7 +191,7 @@ def map_bytes(name, shape, dtype, meta):
     return width * int(np.prod(shape, dtype=np.int64))
 
 
-def _image_size(shape):
+def image_size(shape):
     """Rows and columns of the image that holds a map: trailing axes fold into columns while they fit."""
     spatial = [int(n) for n in shape[:-1]] or [1]
     width = spatial.pop()
@@ -247,7 +247,7 @@ def _open(path, *, header_only):
 def _read_map(path, name, entry, part):
     shape = tuple(entry["shape"])
     byte = entry["dtype"] == "uint8"
-    result = np.zeros((*_image_size(shape), shape[-1]), "float16" if byte else entry["dtype"])
+    result = np.zeros((*image_size(shape), shape[-1]), "float16" if byte else entry["dtype"])
     for i, channel in enumerate(_channel_names(shape[-1])):
         pixels = part.channels[channel].pixels if channel in part.channels else None
         if pixels is None or pixels.shape != result.shape[:2] or pixels.dtype != result.dtype:

@@ -88,8 +88,11 @@ class SampledBTF:
         """
         store = open_store(path)
         if not partial and not store.complete:
+            missing = store.attributes.get("parent", {}).get("images_missing")
             raise InputError(
-                "incomplete: its run was interrupted; start the same command again to finish it",
+                f"incomplete: {missing} images are missing in what it was made from"
+                if missing
+                else "incomplete: its run was interrupted; start the same command again to finish it",
                 file=store.path,
                 field="coverage",
                 got=f"{store.coverage.mean():.1%}",

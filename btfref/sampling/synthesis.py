@@ -13,10 +13,11 @@ from btfref.errors import InputError
 from btfref.mesostructure import build
 from btfref.mesostructure.materials import load_bsdf
 from btfref.numerics.directions import directions
-from btfref.sampling.layout import CONVENTIONS, TILE, check_finite, remove_leftovers, remove_store
+from btfref.sampling.layout import CONVENTIONS, TILE, check_finite, remove_leftovers
 from btfref.sampling.part import Part
+from btfref.sampling.resume import resumable
 from btfref.sampling.sampled_btf import SampledBTF
-from btfref.sampling.store import create_store, open_store
+from btfref.sampling.store import create_store
 from btfref.sampling.variant import mitsuba_variant
 from btfref.versions import versions
 
@@ -245,7 +246,7 @@ class _Job:
         remove_leftovers(out)
         store = None
         if out.exists() or out.is_symlink():
-            store = self._resumable(out, overwrite)
+            store = resumable(out, self.views, self.lights, self.attributes, overwrite)
         if store is None:
             store = create_store(
                 out,
@@ -269,54 +270,6 @@ class _Job:
             else:
                 store.write_part(view, lights, tiles, mean, spread)
         return store
-
-    def _resumable(self, out, overwrite):
-        """The store at ``out`` when it belongs to these settings; None when it was removed."""
-        try:
-            store = open_store(out)
-            found = {
-                "views": store.views.vectors.tolist(),
-                "lights": store.lights.vectors.tolist(),
-                **store.attributes,
-            }
-        except InputError:
-            if not overwrite:
-                raise
-            remove_store(out)
-            return None
-        wanted = {
-            "views": self.views.vectors.tolist(),
-            "lights": self.lights.vectors.tolist(),
-            **self.attributes,
-        }
-        if store.complete:
-            # A finished result stays what it is when a library is updated; a half-done one must not be mixed.
-            wanted.pop("versions")
-        for key, value in wanted.items():
-            if found.get(key) == value:
-                continue
-            if overwrite:
-                remove_store(out)
-                return None
-            field, got, expected = _difference(key, found.get(key), value)
-            raise InputError(
-                "store of other settings; choose another name or overwrite it",
-                file=out,
-                field=field,
-                got=got,
-                expected=expected,
-            )
-        return store
-
-
-def _difference(key, found, wanted):
-    """The first entry in which two settings differ."""
-    while isinstance(found, dict) and isinstance(wanted, dict):
-        inner = next(name for name in {**wanted, **found} if found.get(name) != wanted.get(name))
-        key, found, wanted = f"{key}.{inner}", found.get(inner), wanted.get(inner)
-    if isinstance(wanted, list) and len(wanted) > 8:
-        return key, "other directions", f"{len(wanted)} directions as asked for"
-    return key, found, wanted
 
 
 def _whole(name, value, low, high):

@@ -1,0 +1,82 @@
+"""Write a sampled BTF in a format of others, or the maps of a representation as images.
+
+ubo: pictures named as UBO2003's, in a folder or .zip; utia: likewise as UTIA's; bonn: a .btf file, factored (DFMF) or
+as it is (BDI); maps: a folder of OpenEXR images. Losses and clipped values are reported.
+"""
+
+from __future__ import annotations
+
+from btfref.commands._shared import Progress, count, emit, emit_json, number, number_above, output_file
+from btfref.errors import InputError
+
+#: Option -> what it is called in the library, where that differs.
+_SETTINGS = (
+    "image",
+    "gamma",
+    "quality",
+    "scale",
+    "moved",
+    "family",
+    "components",
+    "error",
+    "colour_model",
+    "scalar",
+)
+
+
+def add_arguments(parser):
+    """Describe the command's arguments."""
+    parser.add_argument(
+        "btf", metavar="BTF", help="sampled BTF (.btf.zarr), or representation (.exr) for maps"
+    )
+    parser.add_argument("-o", "--output", required=True, metavar="OUT", help="folder, .zip or .btf to write")
+    parser.add_argument(
+        "--format", required=True, choices=("ubo", "utia", "bonn", "maps"), help="whose files to write"
+    )
+    images = parser.add_argument_group("ubo, utia")
+    images.add_argument("--image", choices=("jpg", "png", "hdr", "exr"), help="default jpg (ubo), exr (utia)")
+    images.add_argument("--quality", type=count(1), metavar="Q", help="of JPEG (default 95)")
+    images.add_argument(
+        "--gamma", type=number_above(0), metavar="G", help="of 8-bit pictures (ubo; default 2.2)"
+    )
+    images.add_argument("--scale", type=number_above(0), metavar="S", help="divide values by it (default 1)")
+    images.add_argument(
+        "--moved", type=count(0), metavar="DEGREES", help="move the light where it coincides with the camera"
+    )
+    bonn = parser.add_argument_group("bonn")
+    bonn.add_argument("--family", choices=("DFMF", "BDI"), help="default DFMF")
+    bonn.add_argument("--components", type=count(1), metavar="K", help="per channel (default 64)")
+    bonn.add_argument("--error", type=number_above(0), metavar="E", help="relative RMS error that decides K")
+    bonn.add_argument("--colour-model", type=int, choices=(0, 11), help="0: RGB (default), 11: as UBO2014")
+    bonn.add_argument("--scalar", type=int, choices=(2, 4), help="bytes of a factor (default 2)")
+    parser.add_argument("--json", action="store_true", help="print what was written as JSON")
+
+
+def run(args):
+    """Carry the command out."""
+    out = output_file(args.output, *{"bonn": (".btf",)}.get(args.format, ()))
+    settings = {key: getattr(args, key) for key in _SETTINGS if getattr(args, key) is not None}
+
+    with Progress() as progress:
+        if args.format == "maps":
+            from btfref.formats.maps import export_maps
+
+            if settings:
+                raise InputError("maps take no settings", field=next(iter(settings)))
+            facts = export_maps(args.btf, out)
+        else:
+            from btfref.formats import export_btf
+            from btfref.sampling import open_store
+
+            facts = export_btf(open_store(args.btf), out, args.format, progress=progress, **settings)
+    if args.json:
+        emit_json(facts)
+    else:
+        emit(f"{out}: {', '.join(f'{key} {_text(fact)}' for key, fact in facts.items())}")
+    return 0
+
+
+def _text(fact):
+    if isinstance(fact, list):
+        return "/".join(map(_text, fact))
+    return number(fact) if isinstance(fact, float) else str(fact)

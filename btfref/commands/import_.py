@@ -1,0 +1,88 @@
+"""Convert a measured BTF of another format to a sampled BTF.
+
+Reads UBO2003 and ATRIUM (folder or zip), UTIA (folder, zip or MIF), Bonn SPECTRAL folders, Bonn .btf (DFMF, FMF, PVF,
+BDI) and MERL .binary. An interrupted conversion continues when it is started again with the same arguments.
+"""
+
+from __future__ import annotations
+
+from btfref.commands._shared import (
+    Progress,
+    bytes_text,
+    count,
+    direction_set,
+    emit,
+    emit_json,
+    number_above,
+    output_file,
+)
+
+
+def add_arguments(parser):
+    """Describe the command's arguments."""
+    parser.add_argument("path", metavar="PATH", help="file, folder or archive")
+    parser.add_argument("-o", "--output", required=True, metavar="OUT.btf.zarr", help="the store to write")
+    parser.add_argument(
+        "--format", metavar="NAME", help="bonn, mif, merl, spectral, utia or ubo; found from the file"
+    )
+    parser.add_argument(
+        "--allow-missing", action="store_true", help="accept pairs of directions without image"
+    )
+    parser.add_argument(
+        "--cosine", choices=("included", "excluded"), help="whether the values hold the light's cosine"
+    )
+    parser.add_argument("--scale", type=number_above(0), metavar="S", help="factor from the values to 1/sr")
+    parser.add_argument(
+        "--gamma", type=number_above(0), metavar="G", help="of 8-bit pictures (ubo; default 2.2)"
+    )
+    parser.add_argument(
+        "--rows", choices=("up", "down"), default="up", help="up: the top of a picture is v = 1 (default)"
+    )
+    parser.add_argument(
+        "--views", metavar="SET", help="directions of a MERL BRDF, as of synth (default ubo81)"
+    )
+    parser.add_argument("--lights", metavar="SET", help="likewise")
+    parser.add_argument(
+        "--dtype", choices=("float16", "float32"), default="float16", help="of the stored values"
+    )
+    parser.add_argument("--memory", type=count(1), default=2048, metavar="MIB", help="to use (default 2048)")
+    parser.add_argument("--overwrite", action="store_true", help="replace a store of other settings")
+    parser.add_argument("--json", action="store_true", help="print the facts of the store as JSON")
+
+
+def run(args):
+    """Carry the command out."""
+    out = output_file(args.output, ".btf.zarr")
+
+    from btfref.formats.convert import import_btf
+
+    with Progress() as progress:
+        store = import_btf(
+            args.path,
+            out,
+            format=args.format,
+            overwrite=args.overwrite,
+            dtype=args.dtype,
+            cosine=args.cosine,
+            scale=args.scale,
+            rows=args.rows,
+            memory=args.memory << 20,
+            progress=progress,
+            allow_missing=args.allow_missing or None,
+            gamma=args.gamma,
+            views=args.views and direction_set(args.views),
+            lights=args.lights and direction_set(args.lights),
+        )
+    info = store.info()
+    if args.json:
+        emit_json(info)
+        return 0
+    parent = info["parent"]
+    emit(
+        f"{out}: {' × '.join(map(str, info['shape']))} from {parent['format']}, {bytes_text(info['file_bytes'])}"
+    )
+    if parent["images_missing"]:
+        emit(f"  {parent['images_missing']} images are missing: {info['coverage']:.2%} of it there")
+    if parent["lights_moved"]:
+        emit(f"  {len(parent['lights_moved'])} lights were moved out of the camera's way")
+    return 0

@@ -1,0 +1,148 @@
+"""Measured BTFs in the files of others: what can be read and written, found by what the files hold.
+
+A format is a module with an object ``FORMAT`` (see `btfref.formats.source.Format`) and a row below; third parties
+add rows through the entry-point group ``btfref.formats``. Every importer hands over colours in linear Rec. 709 in
+the quantity of its files; `btfref.formats.convert` alone turns that quantity into B.
+"""
+
+from __future__ import annotations
+
+import importlib
+from importlib.metadata import entry_points
+
+from btfref.errors import InputError
+
+__all__ = [
+    "ENTRY_POINT_GROUP",
+    "FORMATS",
+    "export_btf",
+    "format_named",
+    "identify",
+    "import_btf",
+    "names",
+    "open_source",
+]
+
+#: name -> "module:object", imported when asked for; the order in which files are tried.
+FORMATS = {
+    "bonn": "btfref.formats.bonn:FORMAT",
+    "mif": "btfref.formats.mif:FORMAT",
+    "merl": "btfref.formats.merl:FORMAT",
+    "spectral": "btfref.formats.spectral:FORMAT",
+    "utia": "btfref.formats.utia:FORMAT",
+    "ubo": "btfref.formats.ubo:FORMAT",
+}
+
+ENTRY_POINT_GROUP = "btfref.formats"
+
+
+def names():
+    """Names of all formats, built in and from entry points.
+
+    Returns
+    -------
+    list of str
+    """
+    found = (point.name for point in entry_points(group=ENTRY_POINT_GROUP))
+    return [*FORMATS, *sorted(name for name in found if name not in FORMATS)]
+
+
+def format_named(name):
+    """The format of that name.
+
+    Raises
+    ------
+    InputError
+        When there is none.
+    """
+    if name in FORMATS:
+        module, _, attribute = FORMATS[name].partition(":")
+        return getattr(importlib.import_module(module), attribute)
+    for point in entry_points(group=ENTRY_POINT_GROUP):
+        if point.name == name:
+            return point.load()
+    raise InputError(
+        "unknown format", field="format", got=repr(name), expected=f"one of {', '.join(names())}"
+    )
+
+
+def identify(path):
+    """Name of the format of a file, folder or archive, from its first bytes and the names in it.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    str or None
+        None when no format takes it.
+
+    Raises
+    ------
+    InputError
+        Missing or empty file, or an archive that is damaged or dangerous.
+    """
+    from btfref.formats.files import Probe
+
+    probe = Probe(path)
+    return next((name for name in names() if format_named(name).recognises(probe)), None)
+
+
+def open_source(path, *, format=None, **options):
+    """Open a measured BTF; headers only are read.
+
+    Parameters
+    ----------
+    path : path-like
+    format : str, optional
+        Name of the format; found from the file when left out.
+    **options
+        Of the format, such as ``allow_missing`` or ``gamma``.
+
+    Returns
+    -------
+    btfref.formats.source.Source
+
+    Raises
+    ------
+    InputError
+        Not a BTF of a known format, or a damaged one.
+    """
+    name = format or identify(path)
+    if name is None:
+        raise InputError("not a BTF of a known format", file=path, expected=f"one of {', '.join(names())}")
+    return format_named(name).open_checked(path, options)
+
+
+def import_btf(path, out, **settings):
+    """Convert a measured BTF to a store: `btfref.formats.convert.import_btf`."""
+    from btfref.formats.convert import import_btf as run
+
+    return run(path, out, **settings)
+
+
+def export_btf(btf, path, format, **settings):
+    """Write a sampled BTF in a format of others.
+
+    Parameters
+    ----------
+    btf : BTFStore or SampledBTF
+    path : path-like
+        Must not exist.
+    format : str
+        Name of a format that can be written.
+    **settings
+        Of the writer.
+
+    Returns
+    -------
+    dict
+        What was written: facts with JSON types.
+
+    Raises
+    ------
+    InputError
+        A format that is only read, an existing path, or values or directions that the format cannot hold.
+    """
+    return format_named(format).export_checked(btf, path, settings)

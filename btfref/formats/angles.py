@@ -1,0 +1,184 @@
+"""Directions in the names of images: ``tl`` and ``pl`` of the light, ``tv`` and ``pv`` of the camera, in degrees.
+
+The names decide, no grid is assumed. Where light and camera coincide the light cannot stand and is moved; its
+image then carries the angles where it stood. Such an image takes the place of the pair that it was made for.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, defaultdict
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+
+import numpy as np
+
+from btfref.errors import InputError
+from btfref.formats.source import LARGEST_COUNT, direction_set
+
+_ANGLE = re.compile(r"(?<![a-z])(tl|pl|tv|pv)(\d{1,3}(?:\.\d{1,6})?)(?![0-9.]*\d)")
+
+#: A light this far from the camera (degrees) was not moved out of its way; rigs move it by 5 to 15.
+FARTHEST_MOVE = 30.0
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Views × lights with the image of each pair.
+
+    Parameters
+    ----------
+    views, lights : DirectionSet
+    images : dict of (int, int) to str
+        Name of the image of (view, light).
+    moved : dict of (int, int) to (float, float)
+        Where the light really stood, polar angle and azimuth in degrees.
+    present : ndarray of bool, shape (views, lights)
+    """
+
+    views: object
+    lights: object
+    images: dict
+    moved: dict
+    present: np.ndarray
+
+
+def angles_of(name):
+    """(θ_l, φ_l, θ_v, φ_v) in degrees of an image's name, or None.
+
+    φ lies in [0, 360); at the pole it is 0, whatever the name says.
+    """
+    found = _ANGLE.findall(PurePosixPath(name).stem)
+    if len(found) != 4 or len({key for key, _ in found}) != 4:
+        return None
+    angle = {key: float(text) for key, text in found}
+    result = []
+    for theta, phi in (("tl", "pl"), ("tv", "pv")):
+        result += [angle[theta], angle[phi] % 360 if angle[theta] else 0.0]
+    return tuple(result)
+
+
+def style_of(names):
+    """How the first image with angles writes them: "spectral", "utia", "ubo", or None.
+
+    "spectral" puts the camera first, "utia" joins light first by underscores, "ubo" is anything else.
+    """
+    for name in names:
+        stem = PurePosixPath(name).stem
+        if angles_of(name) is not None:
+            if re.search(r"tv[\d.]+_pv[\d.]+_tl[\d.]+_pl", stem):
+                return "spectral"
+            return "utia" if re.search(r"tl[\d.]+_pl[\d.]+_tv[\d.]+_pv", stem) else "ubo"
+    return None
+
+
+def grid(names, file, *, allow_missing=False):
+    """Views × lights of images by name.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Names without angles are passed over.
+    file : path-like
+        For errors.
+    allow_missing : bool
+        Accept pairs without an image.
+
+    Returns
+    -------
+    Grid
+        Directions sorted by θ, then φ, so that rings are found.
+
+    Raises
+    ------
+    InputError
+        No image, one pair twice, pairs missing, or directions below the horizon.
+    """
+    entries = {}
+    for name in names:
+        angles = angles_of(name)
+        if angles is None:
+            continue
+        if angles[0] > 90 or angles[2] > 90:
+            raise InputError("direction below the horizon", file=file, field=name, got=angles)
+        if angles in entries:
+            raise InputError(
+                "two images of one pair of directions", file=file, field=name, got=f"also {entries[angles]}"
+            )
+        entries[angles] = name
+    if not entries:
+        raise InputError("no image with tl, pl, tv and pv in its name", file=file)
+    return arrange(entries, file, allow_missing=allow_missing)
+
+
+def arrange(entries, file, *, allow_missing=False):
+    """Views × lights of images whose directions are known.
+
+    Parameters
+    ----------
+    entries : dict of (float, float, float, float) to object
+        Image by its θ_l, φ_l, θ_v, φ_v in degrees.
+    file, allow_missing
+        As of `grid`.
+
+    Returns
+    -------
+    Grid
+    """
+    views = sorted({(tv, pv) for _, _, tv, pv in entries})
+    moved = _moved(entries, len(views), file)
+    lights = sorted({(tl, pl) for tl, pl, tv, pv in entries if ((tl, pl), (tv, pv)) not in moved})
+    if max(len(views), len(lights)) > LARGEST_COUNT or len(views) * len(lights) > 64 * len(entries) + 4096:
+        raise InputError(
+            "light directions differ from view to view",
+            file=file,
+            got=f"{len(entries)} images of {len(views)} views and {len(lights)} lights",
+            expected="every light at every view",
+        )
+    at = {view: i for i, view in enumerate(views)}, {light: i for i, light in enumerate(lights)}
+    images, where = {}, {}
+    for (tl, pl, tv, pv), name in entries.items():
+        nominal = (tv, pv) if ((tl, pl), (tv, pv)) in moved else (tl, pl)
+        pair = at[0][tv, pv], at[1][nominal]
+        images[pair] = name
+        if nominal != (tl, pl):
+            where[pair] = (tl, pl)
+    present = np.zeros((len(views), len(lights)), bool)
+    present[tuple(np.array(list(images)).T)] = True
+    if not present.all() and not allow_missing:
+        view, light = np.argwhere(~present)[0]
+        raise InputError(
+            "images are missing",
+            file=file,
+            field="light {:g}° {:g}°, camera {:g}° {:g}°".format(*lights[light], *views[view]),
+            got=f"{int((~present).sum())} of {present.size} missing",
+            expected="all (or to allow missing ones)",
+        )
+    sets = (direction_set(*np.radians(list(zip(*found, strict=True))), file) for found in (views, lights))
+    return Grid(*sets, images, where, present)
+
+
+def _moved(entries, n_views, file):
+    """((θ_l, φ_l), (θ_v, φ_v)) of images whose light was moved out of the camera's way."""
+    views_of = defaultdict(set)
+    for tl, pl, tv, pv in entries:
+        views_of[tl, pl].add((tv, pv))
+    common = {light for light, seen in views_of.items() if 2 * len(seen) >= n_views}
+    moved = set()
+    for light, seen in views_of.items():
+        if light not in common and all(
+            view in common and view not in views_of[view] and _apart(light, view) <= FARTHEST_MOVE
+            for view in seen
+        ):
+            moved |= {(light, view) for view in seen}
+    twice = [view for view, count in Counter(view for _, view in moved).items() if count > 1]
+    if twice:
+        raise InputError("several lights moved for one camera", file=file, got=twice[0], expected="one")
+    return moved
+
+
+def _apart(first, second):
+    """Angle between two directions given in degrees, in degrees."""
+    a, b = np.radians(first), np.radians(second)
+    cosine = np.cos(a[0]) * np.cos(b[0]) + np.sin(a[0]) * np.sin(b[0]) * np.cos(a[1] - b[1])
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))

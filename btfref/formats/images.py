@@ -1,0 +1,113 @@
+"""Folders and archives with one image per pair of directions: what UBO2003, UTIA and SPECTRAL share."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+
+from btfref.errors import InputError
+from btfref.formats import pictures
+from btfref.formats.angles import grid, style_of
+from btfref.formats.files import files_of
+from btfref.formats.source import Source
+
+#: Our own note beside exported images: what 8 bits and names cannot say. Other readers pass it over.
+NOTE = "btfref.json"
+
+
+def recogniser(style):
+    """``recognises(probe)`` of folders and archives whose names are of that style."""
+
+    def recognises(probe):
+        return probe.files is not None and style_of(probe.files.images()) == style
+
+    return recognises
+
+
+def image_source(path, name, to_linear, *, cosine_included, scale, allow_missing=False, facts=None):
+    """A source of one image per pair.
+
+    Parameters
+    ----------
+    path : path-like
+        Folder or zip archive.
+    name : str
+        Of the format.
+    to_linear : callable
+        ``to_linear(pixels, channels, where)``: linear Rec. 709, float32 (rows, columns, 3), of what
+        `btfref.formats.pictures.decode` gives.
+    cosine_included, scale
+        As of `Source`, where no note of ours says otherwise.
+    allow_missing : bool
+    facts : dict, optional
+
+    Returns
+    -------
+    Source
+    """
+    files = files_of(path)
+    found = grid(files.images(), path, allow_missing=allow_missing)
+    first = next(iter(found.images.values()))
+    kind, rows, columns, channels = pictures.header(files.read(first), files.where(first))
+    note = _note(files)
+    texels = rows, columns
+
+    def colours(view, start, stop):
+        result = np.zeros((stop - start, rows, columns, 3), np.float32)
+        for slot, light in enumerate(range(start, stop)):
+            image = found.images.get((view, light))
+            if image is not None:
+                where = files.where(image)
+                result[slot] = to_linear(*pictures.decode(files.read(image), where, texels), where)
+        return result
+
+    return Source(
+        path=files.path,
+        format=name,
+        views=found.views,
+        lights=found.lights,
+        texels=texels,
+        colours=colours,
+        cosine_included=note.get("cosine_included", cosine_included),
+        scale=note.get("scale", scale),
+        facts={
+            "images": len(found.images),
+            "pictures": {"8bit": "8 bits", "hdr": "Radiance", "exr": "OpenEXR"}[kind],
+            "channels": list(channels),
+            "file_bytes": sum(files.sizes.values()),
+            **(facts or {}),
+        },
+        present=found.present,
+        moved=found.moved,
+        fingerprint=files.fingerprint(),
+    )
+
+
+def _note(files):
+    """Entries of our note that are valid, or none."""
+    if NOTE not in files.sizes:
+        return {}
+    try:
+        note = json.loads(files.read(NOTE))
+        scale, included = float(note["scale"]), note["cosine_included"]
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError("damaged note", file=files.where(NOTE), got=repr(error)) from None
+    if not (1e-12 < scale < 1e12 and isinstance(included, bool)):
+        raise InputError("damaged note", file=files.where(NOTE), got=str(note)[:200])
+    return {"scale": scale, "cosine_included": included}
+
+
+def pick(channels, names, where):
+    """Indices of named channels.
+
+    Raises
+    ------
+    InputError
+        When one is missing.
+    """
+    if not set(names) <= set(channels):
+        raise InputError(
+            "channels of a picture", file=where, got=", ".join(channels)[:200], expected=", ".join(names)
+        )
+    return [channels.index(name) for name in names]

@@ -1,0 +1,73 @@
+"""The maps of a representation as images that any viewer opens."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from btfref.errors import InputError
+from btfref.sampling.layout import refuse_existing
+
+
+def export_maps(path, out):
+    """Write every map as one OpenEXR image or, beyond four channels, as one per channel.
+
+    Parameters
+    ----------
+    path : path-like
+        Representation.
+    out : path-like
+        Folder to make.
+
+    Returns
+    -------
+    dict
+        ``maps`` and ``images``: how many.
+
+    Raises
+    ------
+    InputError
+        No representation, or an existing path.
+
+    Notes
+    -----
+    Axes before the last fold into rows and columns as in the representation's file: trailing ones into columns while
+    they fit. Indices are written as floats.
+    """
+    from btfref.formats.pictures import write_exr
+    from btfref.representations.container import image_size, load
+
+    out = Path(out)
+    refuse_existing(out)
+    if not out.absolute().parent.is_dir():
+        raise InputError("no such folder", file=out.parent)
+    arrays = load(path).arrays()
+    temporary = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.absolute().parent))
+    count = 0
+    try:
+        folder = temporary / "maps"
+        folder.mkdir()
+        for name, array in arrays.items():
+            array = np.asarray(array)
+            image = array.reshape(*image_size(array.shape), array.shape[-1]).astype(np.float32)
+            groups = (
+                {"": image}
+                if image.shape[-1] <= 4
+                else {f".{c:04d}": image[..., c : c + 1] for c in range(image.shape[-1])}
+            )
+            for suffix, planes in groups.items():
+                names = {1: "Y", 2: "RG", 3: "RGB", 4: "RGBA"}[planes.shape[-1]]
+                write_exr(
+                    dict(zip(names, np.moveaxis(planes, -1, 0), strict=True)),
+                    folder / f"{name}{suffix}.exr",
+                    np.float32,
+                )
+                count += 1
+        os.replace(folder, out)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    return {"format": "maps", "maps": len(arrays), "images": count}

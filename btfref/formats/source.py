@@ -1,0 +1,172 @@
+"""What every importer provides, and the row that a format has in the registry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from btfref.errors import InputError
+from btfref.numerics.directions import NAMED_RINGS, RING_TOLERANCE, checked, directions, spherical
+
+#: Bytes that a conversion may hold at a time, unless told otherwise.
+MEMORY = 2 << 30
+
+#: More directions than any measured set has; headers beyond it are damaged.
+LARGEST_COUNT = 1 << 16
+
+
+@dataclass
+class Source:
+    """A measured BTF whose headers were read and whose values are read part by part.
+
+    Parameters
+    ----------
+    path : Path
+    format : str
+        Name of its format.
+    views, lights : DirectionSet
+    texels : tuple of int
+        Rows and columns.
+    colours : callable
+        ``colours(view, first, last)``: linear Rec. 709 of the lights ``first … last − 1`` of a view, float32,
+        shape (last − first, rows, columns, 3), row 0 the first of the picture, in the quantity of the file.
+        Where `present` is False the values are arbitrary.
+    cosine_included : bool
+        Whether that quantity holds cos θ_light.
+    scale : float
+        Factor from that quantity to 1/sr.
+    facts : dict
+        What ``btfref info`` says beyond the above; JSON types.
+    present : ndarray of bool, shape (views, lights), optional
+        What was measured; all by default.
+    moved : dict of (int, int) to (float, float)
+        Pairs measured with the light elsewhere: (view, light) -> polar angle and azimuth in degrees.
+    fingerprint : str
+        Changes with the content, as far as headers, names and sizes show it; a resumed run checks it.
+    """
+
+    path: Path
+    format: str
+    views: object
+    lights: object
+    texels: tuple
+    colours: Callable
+    cosine_included: bool
+    scale: float = 1.0
+    facts: dict = field(default_factory=dict)
+    present: np.ndarray | None = None
+    moved: dict = field(default_factory=dict)
+    fingerprint: str = ""
+    memory: int = MEMORY
+
+    def __post_init__(self):
+        if self.present is None:
+            self.present = np.ones((len(self.views), len(self.lights)), bool)
+
+    def info(self):
+        """Facts from the headers; JSON types, keys as those of a store where they mean the same."""
+        shape = [len(self.views), len(self.lights), *self.texels, 3]
+        return {
+            "kind": "measured-btf",
+            "format": self.format,
+            "shape": shape,
+            "directions": {
+                "views": {"name": self.views.name, "count": len(self.views)},
+                "lights": {"name": self.lights.name, "count": len(self.lights)},
+            },
+            "cosine": "included" if self.cosine_included else "not included",
+            "scale": self.scale,
+            "images_missing": int((~self.present).sum()),
+            "lights_moved": len(self.moved),
+            "raw_bytes": 4 * int(np.prod([int(n) for n in shape], dtype=object)),
+            **self.facts,
+        }
+
+
+@dataclass(frozen=True)
+class Format:
+    """A row of the registry.
+
+    Parameters
+    ----------
+    name, title : str
+    recognises : callable
+        ``recognises(probe) -> bool``, from the first bytes and the names (`btfref.formats.files.Probe`).
+    open : callable
+        ``open(path, **options) -> Source``; raises InputError.
+    options : frozenset of str
+        What `open` takes.
+    export : callable, optional
+        ``export(btf, path, **settings) -> dict``; None for a format that is only read.
+    settings : frozenset of str
+        What `export` takes.
+    """
+
+    name: str
+    title: str
+    recognises: Callable
+    open: Callable
+    options: frozenset = frozenset()
+    export: Callable | None = None
+    settings: frozenset = frozenset()
+
+    def open_checked(self, path, options):
+        """`open` with options that were given (None counts as not given) and that the format knows."""
+        return self.open(path, **self._known(options, self.options))
+
+    def export_checked(self, btf, path, settings):
+        """`export` likewise, to a path that does not exist."""
+        from btfref.sampling.layout import refuse_existing
+
+        if self.export is None:
+            raise InputError("this format is only read", field="format", got=repr(self.name))
+        settings = self._known(settings, self.settings | {"progress"})
+        path = Path(path)
+        refuse_existing(path)
+        if not path.absolute().parent.is_dir():
+            raise InputError("no such folder", file=path.parent)
+        return self.export(btf, path, **settings)
+
+    def _known(self, given, known):
+        given = {key: value for key, value in given.items() if value is not None}
+        for key in given:
+            if key not in known:
+                raise InputError(
+                    f"format '{self.name}' has no such option",
+                    field=key,
+                    expected=f"one of {', '.join(sorted(known)) or 'none'}",
+                )
+        return given
+
+
+def direction_set(theta, phi, file):
+    """Directions of a file, by name where they are a known set.
+
+    Parameters
+    ----------
+    theta, phi : array_like, shape (n,)
+        Radians.
+    file : path-like
+        For errors.
+
+    Returns
+    -------
+    DirectionSet
+        Of a named set exactly, when every direction is within the tolerance of rings.
+
+    Raises
+    ------
+    InputError
+        Below the horizon, twice the same, or a set that cannot be interpolated.
+    """
+    vectors = spherical(np.asarray(theta, float), np.asarray(phi, float))
+    for name in NAMED_RINGS:
+        known = directions(name)
+        if len(known) == len(vectors) and np.abs(known.vectors - vectors).max() < RING_TOLERANCE:
+            return known
+    # A horizon in degrees or float32 lies a rounding below z = 0.
+    vectors[:, 2] = np.where(np.abs(vectors[:, 2]) < 1e-6, np.maximum(vectors[:, 2], 0), vectors[:, 2])
+    return checked(vectors, "custom", file=file)

@@ -1,0 +1,88 @@
+"""UTIA: one picture per pair, ``tvTTT_pvPPP/tlTTT_plPPP_tvTTT_pvPPP.png`` (sRGB) or ``.exr`` (CIE XYZ, D65, white 100).
+
+The values are reflectance factors: the owners' plugin for Mitsuba multiplies them by cos θ_light / π. So f = value / π
+and B = f · cos θ_light. XYZ are divided by 100 and turned into linear Rec. 709; unlike that plugin we keep the
+negative channels of colours outside that gamut.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from btfref.errors import InputError
+from btfref.formats.images import image_source, pick, recogniser
+from btfref.formats.source import Format
+from btfref.numerics.colour import RGB_TO_XYZ, decode_srgb, encode_srgb, rgb_from_xyz
+
+#: XYZ of a perfect diffuser has this Y.
+WHITE = 100.0
+
+#: Factor from a reflectance factor to 1/sr.
+SCALE = 1 / np.pi
+
+
+def xyz_to_rgb(pixels):
+    """Linear Rec. 709 of UTIA's XYZ (white at Y = 100), same shape, float32."""
+    return rgb_from_xyz(np.asarray(pixels, np.float32) / np.float32(WHITE)).astype(np.float32)
+
+
+def rgb_to_xyz(values):
+    """UTIA's XYZ of linear Rec. 709, same shape."""
+    return np.asarray(values) @ RGB_TO_XYZ.T * WHITE
+
+
+def open_utia(path, *, allow_missing=False):
+    """Open a folder or zip archive.
+
+    Parameters
+    ----------
+    path : path-like
+    allow_missing : bool
+        Accept pairs without a picture.
+
+    Returns
+    -------
+    Source
+    """
+    curve = decode_srgb(np.arange(256) / 255).astype(np.float32)
+
+    def to_linear(pixels, channels, where):
+        if pixels.dtype == np.uint8:
+            return curve[pixels]
+        # Writers that know three channels only call X, Y and Z by the names of colours.
+        names = ("X", "Y", "Z") if "X" in channels else ("R", "G", "B")
+        return xyz_to_rgb(pixels[..., pick(channels, names, where)])
+
+    return image_source(
+        path, "utia", to_linear, cosine_included=False, scale=SCALE, allow_missing=allow_missing
+    )
+
+
+def export(btf, path, **settings):
+    """Write pictures: `btfref.formats.image_export.export_images` with names of UTIA."""
+    from btfref.formats.image_export import export_images
+
+    settings = {"image": "exr", **settings}
+    if settings["image"] not in ("png", "exr"):
+        raise InputError("kind of picture", field="image", got=settings["image"], expected="png or exr")
+
+    def encode(values):
+        return np.round(255 * encode_srgb(np.clip(values, 0, 1))).astype(np.uint8)
+
+    def planes(values):
+        return dict(zip("XYZ", np.moveaxis(rgb_to_xyz(values), -1, 0), strict=True))
+
+    return export_images(
+        btf, path, style="utia", encode=encode, planes=planes, divisor=SCALE, with_cosine=False, **settings
+    )
+
+
+FORMAT = Format(
+    "utia",
+    "UTIA folders and archives of pictures",
+    recogniser("utia"),
+    open_utia,
+    options=frozenset({"allow_missing"}),
+    export=export,
+    settings=frozenset({"image", "scale", "moved"}),
+)
