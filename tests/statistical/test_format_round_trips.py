@@ -1,0 +1,94 @@
+"""Synthesized materials out to every format and back, and a measured-style BTF through the whole chain."""
+
+import numpy as np
+import pytest
+
+from btfref.cli import main
+from btfref.compare import load_image, tolerance
+from btfref.formats import export_btf, import_btf
+from btfref.numerics.directions import directions
+from btfref.sampling import SampledBTF
+from btfref.sampling.synthesis import synthesize
+
+#: The pole and the rings at 15° and 30°: whole degrees, which names can say.
+FEW = directions("ubo81").vectors[:19]
+
+
+@pytest.fixture(scope="module", params=["checker", "rings", "tissue"])
+def material(request):
+    return synthesize(request.param, texels=8, views=FEW, lights=FEW, spp=4)
+
+
+def back(path, **settings):
+    return SampledBTF.load(import_btf(path, path.with_name(path.name + ".btf.zarr"), **settings).path)
+
+
+#: Format, settings, and the gate of the largest error over the largest value; None: the stored bits themselves.
+EXACT = [
+    ("bonn", "x.btf", {"family": "BDI"}),
+    ("ubo", "x", {"image": "exr"}),
+    ("ubo", "x.zip", {"image": "exr"}),
+]
+
+
+@pytest.mark.parametrize(("format", "name", "settings"), EXACT)
+def test_formats_of_half_floats_are_exact(format, name, settings, material, tmp_path):
+    export_btf(material, tmp_path / name, format, **settings)
+    found = back(tmp_path / name)
+    assert np.array_equal(found.values, material.values)
+    np.testing.assert_allclose(found.lights.vectors, material.lights.vectors, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("format", "settings", "gate"),
+    [
+        ("utia", {"image": "exr"}, "formats.half_xyz"),
+        ("ubo", {"image": "hdr"}, "formats.radiance"),
+        ("ubo", {"image": "png"}, "formats.code_gamma"),
+        ("utia", {"image": "png"}, "formats.code_srgb"),
+    ],
+)
+def test_other_pictures_err_as_their_codes_do(format, settings, gate, material, tmp_path):
+    largest = float(material.values.max())
+    if settings["image"] == "png":
+        # UTIA's codes hold π · B / cos θ: the largest cosine's inverse here is that of 30°.
+        settings = settings | {"scale": largest * (np.pi / np.cos(np.pi / 6) if format == "utia" else 1)}
+    facts = export_btf(material, tmp_path / "x", format, **settings)
+    error = np.abs(back(tmp_path / "x", dtype="float32").values - material.values.astype(float)).max()
+    assert facts["clipped"] == 0
+    assert error / largest <= tolerance(f"{gate}.max")
+
+
+@pytest.mark.parametrize("components", [4, 16])
+def test_dfmf_errs_as_it_says(components, material, tmp_path):
+    facts = export_btf(material, tmp_path / "x.btf", "bonn", components=components, scalar=4)
+    original = material.values.astype(float)
+    difference = back(tmp_path / "x.btf", dtype="float32").values - original
+    error = np.sqrt((difference**2).sum((0, 1, 2, 3)) / (original**2).sum((0, 1, 2, 3)))
+    np.testing.assert_allclose(error, facts["error"], rtol=1e-3, atol=1e-6)
+
+
+def test_measured_style(tmp_path, monkeypatch, capsys):
+    """JPEG pictures to 75° with lights moved out of the camera's way, through fit, both renderers and their gate."""
+    monkeypatch.chdir(tmp_path)
+    original = synthesize("checker", texels=8, views="ubo81", lights="ubo81", spp=4, estimator="surface")
+    scale = float(np.quantile(original.values, 0.9995))
+    facts = export_btf(original, tmp_path / "m.zip", "ubo", image="jpg", scale=scale, moved=10)
+    assert facts["lights_moved"] == 81
+    assert facts["clipped"] > 0
+    imported = back(tmp_path / "m.zip")
+    assert imported.views == original.views
+    assert imported.lights == original.lights
+    relative = np.sqrt(
+        ((imported.values.astype(float) - original.values) ** 2).mean()
+        / (original.values.astype(float) ** 2).mean()
+    )
+    assert relative < 0.5  # it is that BTF and no other; its losses are meant
+    for command in (
+        ["fit", "lpca", "m.zip.btf.zarr", "-o", "m.exr", "--set", "clusters=4", "components=4"],
+        ["render", "cloth", "-o", "a.exr", "-D", "btf=m.exr", "--noise-free", "2", "--size", "64x48"],
+        ["realtime", "cloth", "-o", "b.exr", "-D", "btf=m.exr", "--grid", "2", "--size", "64x48"],
+        ["compare", "b.exr", "a.exr"],
+    ):
+        assert main(command) == 0, (command, capsys.readouterr())
+    assert load_image("a.exr").max() > 0
