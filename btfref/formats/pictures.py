@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import struct
 import tempfile
@@ -179,7 +180,11 @@ def _exr(data, where, channels, shape):
         stream.write(data)
         stream.flush()
         try:
-            with OpenEXR.File(stream.name, separate_channels=True) as file:
+            # They print a warning of what they then raise.
+            with (
+                contextlib.redirect_stdout(io.StringIO()),
+                OpenEXR.File(stream.name, separate_channels=True) as file,
+            ):
                 found = file.channels()
                 planes = [np.asarray(found[name].pixels, np.float32) for name in channels]
         except Exception as error:  # the bindings raise several kinds for a broken file
