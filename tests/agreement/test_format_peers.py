@@ -5,6 +5,8 @@ and says so:
 
 BTFREF_BTF_EXTRACTOR  a Python (3.8 or 3.9) with btf-extractor 1.7 (NumPy < 1.20, Cython 0.29, C++) and OpenCV
 BTFREF_PYSMTB         a Python with pysmtb 0.4
+BTFREF_MIFDUMP        a program built with UTIA's MIFlib 0.4 (its header wants mending for GCC): for each pair of
+                      the BTF "b" a line with index, θ_l, φ_l, θ_v, φ_v in degrees and all values of its image
 BTFREF_BTFLIB         the folder ``matlab/@btf/private`` of the data owners' btflib, run by Octave
 
 Their known differences from the data's definition are asserted here, so that they stay explained: see README.
@@ -214,6 +216,25 @@ def test_pysmtb_parses_our_dfmf(tmp_path):
     source = open_source(tmp_path / "x.btf")
     ours = np.stack([source.colours(view, 0, 8) for view in range(8)])
     np.testing.assert_allclose(ours, theirs, atol=tolerance("formats.float_factors.max"))
+
+
+@pytest.mark.parametrize("reference", [False, True])
+def test_owners_library_reads_mif_as_we_do(reference, tmp_path):
+    """Images, index map and directions; MIFlib decodes float32 images only."""
+    program = peer("BTFREF_MIFDUMP")
+    values = material.pictures()
+    pairs = [(light, view) for view in material.ANGLES for light in material.ANGLES]
+    order = np.random.default_rng(0).permutation(25)
+    images = [None] * 25
+    for pair, index in enumerate(order):
+        images[index] = values.reshape(25, 3, 4, 3)[pair].astype(np.float32)
+    path = tmp_path / "x.mif"
+    path.write_bytes(material.mif(images, pairs, space="RGB", order=order.tolist(), reference=reference))
+    theirs = np.array([line.split() for line in run(program, str(path)).splitlines()], float)
+    assert theirs.shape == (25, 5 + 36)
+    source = open_source(path)
+    for (view, light), row in zip(by_angles(source, theirs[:, 1:5]), theirs, strict=True):
+        np.testing.assert_allclose(source.colours(view, light, light + 1).ravel(), row[5:], rtol=1e-6)
 
 
 def test_owners_code_decodes_as_we_do(tmp_path):
