@@ -86,7 +86,7 @@ def test_merl_truncated_and_padded(tmp_path):
 
 def test_negative_entries_count_as_black(tmp_path):
     (tmp_path / "x.binary").write_bytes(material.merl(lambda h, d, p: np.full((*h.shape, 3), -1.0)))
-    assert not imported(tmp_path / "x.binary").values.any()
+    assert not imported(tmp_path / "x.binary", views="2x4", lights="2x4").values.any()
 
 
 # --- MIF ----------------------------------------------------------------------------------------------------------
