@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from argparse import ArgumentTypeError
 from pathlib import Path
@@ -105,6 +106,25 @@ def ranges(text):
             raise ArgumentTypeError(f"got {text!r}, expected numbers and ranges such as 0,3,10-12")
         found.extend(range(int(first), int(last if dash else first) + 1))
     return tuple(found)
+
+
+def memory_size(text):
+    """An amount of memory such as ``2G``, ``800MiB`` in bytes, for argparse's ``type=``."""
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([kMGT]?)(?:i?B)?", text)
+    if found is None or not float(found[1]):
+        raise ArgumentTypeError(f"got {text!r}, expected an amount such as 800M or 2G")
+    return int(float(found[1]) * 1024 ** " kMGT".index(found[2] or " "))
+
+
+def positive(text):
+    """A number above 0, for argparse's ``type=``."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = 0.0
+    if not 0 < number < float("inf"):
+        raise ArgumentTypeError(f"got {text!r}, expected a number above 0")
+    return number
 
 
 def numbers_or_file(text):

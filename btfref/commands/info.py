@@ -1,10 +1,13 @@
-"""Say what a representation, a sampled or measured BTF or an image holds, from its headers only."""
+"""Say what a representation, a sampled or measured BTF or an image holds, from its headers only.
+
+With --plot a picture of a sampled BTF: view × light contact sheet, one texel's apparent BRDF, albedo, noise.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from btfref.commands._shared import bytes_text, emit, emit_json
+from btfref.commands._shared import bytes_text, emit, emit_json, output_file, ranges
 from btfref.errors import InputError
 
 _BYTES = ("payload_bytes", "file_bytes", "raw_bytes")
@@ -16,11 +19,29 @@ def add_arguments(parser):
         "file", metavar="FILE", help="representation (.exr), sampled BTF (.btf.zarr), measured BTF, or image"
     )
     parser.add_argument("--json", action="store_true", help="print the facts as JSON")
+    parser.add_argument("--plot", metavar="OUT.png", help="draw a sampled BTF")
+    parser.add_argument(
+        "--texel",
+        type=ranges,
+        metavar="ROW,COLUMN",
+        help="whose apparent BRDF is drawn (default: the middle)",
+    )
 
 
 def run(args):
     """Carry the command out."""
+    plot = output_file(args.plot, ".png") if args.plot else None
+    if args.texel is not None and (plot is None or len(args.texel) != 2):
+        raise InputError(
+            "texel of a plot", field="--texel", got=args.texel, expected="ROW,COLUMN with --plot"
+        )
     facts = read(args.file)
+    if plot is not None:
+        if facts["kind"] != "sampled-btf":
+            raise InputError("only sampled BTFs are drawn", file=args.file, field="--plot", got=facts["kind"])
+        from btfref.report.btf_plot import plot_btf
+
+        plot_btf(args.file, plot, texel=args.texel)
     if args.json:
         emit_json(facts)
     else:

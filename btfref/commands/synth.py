@@ -1,6 +1,13 @@
-"""Path trace a modelled mesostructure into a sampled BTF.
+"""Synthesize a sampled BTF from a mesostructure, a mesh or a height map.
 
-An interrupted run continues where it stopped when it is started again with the same arguments.
+An interrupted run continues where it stopped when it is started again with the same arguments. --views and
+--lights choose the directions that the BTF has; --only-views, --only-lights and --only-tiles fill a part of
+it now, and the same command with another part, or without, fills more later (btfref info says what is there).
+
+  btfref synth checker -o checker.btf.zarr --views ubo81 --lights ubo81 --spp 16
+  btfref synth stone.png -o stone.btf.zarr --albedo stone-colour.png --roughness 0.6 --amplitude 0.1
+  btfref synth cloth.glb -o cloth.btf.zarr --target-error 0.02 --memory 4G
+  btfref synth weave.ply --bsdf yarn.xml -o weave.btf.zarr --scheduler dask --workers 4
 """
 
 from __future__ import annotations
@@ -13,8 +20,10 @@ from btfref.commands._shared import (
     direction_set,
     emit,
     emit_json,
+    memory_size,
     numbers_or_file,
     output_file,
+    positive,
     ranges,
 )
 from btfref.errors import InputError
@@ -41,7 +50,23 @@ def add_arguments(parser):
     parser.add_argument("--views", default="ubo81", metavar="SET", help=directions)
     parser.add_argument("--lights", default="ubo81", metavar="SET", help="likewise")
     parser.add_argument(
-        "--spp", type=count(2), default=64, metavar="N", help="paths per texel and view (default 64)"
+        "--spp",
+        type=count(2),
+        metavar="N",
+        help="paths (or surface points) per texel and view (default 64); with --target-error the most that a "
+        "texel gets (default 4096)",
+    )
+    parser.add_argument(
+        "--target-error",
+        type=positive,
+        metavar="E",
+        help="place samples where they are needed for this relative standard error of the whole BTF, e.g. 0.02",
+    )
+    parser.add_argument(
+        "--texel-error",
+        type=positive,
+        metavar="E",
+        help="and for this one at most of every texel of a view (default: no limit)",
     )
     parser.add_argument("--max-depth", type=count(2), default=8, metavar="N", help="as Mitsuba's (default 8)")
     parser.add_argument("--seed", type=count(0), default=0, metavar="N")
@@ -82,6 +107,24 @@ def add_arguments(parser):
         parser.add_argument(
             f"--only-{name}", type=ranges, metavar="I,J-K", help=f"fill these {name} now, the rest later"
         )
+    parser.add_argument(
+        "--memory",
+        type=memory_size,
+        metavar="SIZE",
+        help="budget, e.g. 2G, of all processes together, or of each worker at an address (default: half of "
+        "the machine's); without influence on the result",
+    )
+    parser.add_argument(
+        "--scheduler",
+        metavar="dask|ADDRESS",
+        help="workers of a local Dask cluster, or of the one at tcp://HOST:PORT, whose workers see the same files",
+    )
+    parser.add_argument(
+        "--workers", type=count(1), metavar="N", help="of the local cluster (default: one per two processors)"
+    )
+    parser.add_argument(
+        "--variant", default="llvm_ad_rgb", help="of Mitsuba (default llvm_ad_rgb; cuda_ad_rgb)"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace a store of other settings")
     parser.add_argument("--json", action="store_true", help="print the facts of the store as JSON")
 
@@ -102,6 +145,9 @@ def run(args):
         "max_depth": args.max_depth,
         "dtype": args.dtype,
         "estimator": args.estimator,
+        "target_error": args.target_error,
+        "texel_error": args.texel_error,
+        "variant": args.variant,
     }
     for key in parameters:
         if key in settings:
@@ -113,6 +159,7 @@ def run(args):
 
     only = Part(args.only_views, args.only_lights, args.only_tiles)
 
+    peak = []
     with Progress() as progress:
         store = synthesize_store(
             out,
@@ -120,13 +167,29 @@ def run(args):
             overwrite=args.overwrite,
             progress=progress,
             only=only,
+            memory=args.memory,
+            scheduler=args.scheduler,
+            workers=args.workers,
+            report=peak.append,
             **settings,
             **parameters,
         )
-    info = store.info()
+    info = store.info() | {"peak_memory_bytes": peak[0]}
     if args.json:
         emit_json(info)
-    else:
-        there = "" if info["complete"] else f", {info['coverage']:.1%} of it there"
-        emit(f"{out}: {' × '.join(map(str, info['shape']))}, {bytes_text(info['file_bytes'])}{there}")
+        return 0
+    there = "" if info["complete"] else f", {info['coverage']:.1%} of it there"
+    emit(f"{out}: {' × '.join(map(str, info['shape']))}, {bytes_text(info['file_bytes'])}{there}")
+    emit(f"largest memory of a process: {bytes_text(peak[0])}")
+    if info["error"]:
+        emit(error_text(info["error"]))
     return 0
+
+
+def error_text(error):
+    """One line on what a synthesis to a target error has reached."""
+    samples = error["samples"]
+    text = f"relative standard error {error['reached']:.2%} (target {error['target']:.2%})"
+    if error["texel_target"] is not None:
+        text += f", {error['texels_above']:.2%} of texels above {error['texel_target']:.2%}"
+    return text + f"; {samples['mean']:.1f} samples a texel ({samples['least']} to {samples['most']})"

@@ -1,19 +1,27 @@
-"""The file of a sampled BTF: a Zarr v3 directory ``NAME.btf.zarr``, written view by view and resumable.
+"""The file of a sampled BTF: a Zarr v3 directory ``NAME.btf.zarr``, written shard by shard and resumable.
 
 ======== ============================== =============== ================================================
 array    shape                          type            chunks
 ======== ============================== =============== ================================================
-values   view, light, row, column, 3    float16/float32 one (view, light, tile); one file holds a view
+values   view, light, row, column, 3    float16/float32 one (view, light, tile); one file holds a shard
 variance the same                       float32         the same; variance of the mean of each value
 coverage view, light, tile row, column  uint8           one view; 1 where values (and variance) are there
 views    view, 3                        float64         whole
 lights   light, 3                       float64         whole
 ======== ============================== =============== ================================================
 
-A view is one shard (one file): it is written at once, under a temporary name first. Inner chunks carry a
-checksum and are read alone by byte ranges. Coverage is written after the values it vouches for, so that a
-killed run never looks complete. Attributes hold every convention; nothing in the store depends on the time
-or on the number of attempts.
+A shard is one file, written at once, under a temporary name first: a view, or some tiles of it where a view is
+larger than `SHARD`. Inner chunks carry a checksum and are read alone by byte ranges. Coverage is written after
+the values it vouches for, so that a killed run never looks complete. Attributes hold every convention; nothing
+in the store depends on the time or on the number of attempts.
+
+Stores made to a target error have three more arrays, a view a chunk (see `btfref.sampling.adaptive`):
+
+======== =================== ======= =============================================================================
+pilot    view, row, column, 3 float32 of two pilots, mean variance of one sample each; their mean value
+samples  view, row, column    uint32  samples that the texel got in this view
+reached  view, row, column, 2 float32 mean variance of the mean, and mean value, over lights and channels
+======== =================== ======= =============================================================================
 
 Chunks are uncompressed: on noisy half floats zstd saves 15 % and doubles the time of reading. Tiles of 64²
 keep a 64² · 81² BTF at one inner chunk a pair (read whole in 1.3 s, in 4.0 s with tiles of 32²: the cost is
@@ -34,6 +42,10 @@ from btfref.errors import InputError
 
 #: Texels along one side of an inner chunk.
 TILE = 64
+
+#: Bytes (as 32-bit floats) that a shard holds at most, unless a single chunk is larger: what must be in memory
+#: to write a part of a view.
+SHARD = 64 << 20
 
 KIND = "sampled-btf"
 
@@ -111,7 +123,31 @@ def refuse_existing(path):
         raise InputError("exists already", file=path, expected="a new name (or to overwrite)")
 
 
-def write_headers(path, views, lights, texels, dtype, variance, tile, attributes):
+def shard_shape(n_lights, texels, tile):
+    """Lights, tile rows and tile columns of one shard.
+
+    Parameters
+    ----------
+    n_lights : int
+    texels : tuple of int
+        Rows and columns.
+    tile : tuple of int
+        Rows and columns of an inner chunk.
+
+    Returns
+    -------
+    tuple of int
+    """
+    rows, columns = (-(-n // side) for n, side in zip(texels, tile, strict=True))
+    chunk = 12 * tile[0] * tile[1]
+    lights = max(1, min(n_lights, SHARD // chunk))
+    columns = max(1, min(columns, SHARD // (chunk * lights)))
+    whole = -(-texels[1] // tile[1])
+    rows = max(1, min(rows, SHARD // (chunk * lights * columns))) if columns == whole else 1
+    return lights, rows, columns
+
+
+def write_headers(path, views, lights, texels, dtype, variance, tile, attributes, adaptive=False):
     """Lay out an empty store; arguments as of `btfref.sampling.store.create_store`."""
     if dtype not in ("float16", "float32"):
         raise InputError("type of the values", field="dtype", got=repr(dtype), expected="float16 or float32")
@@ -121,6 +157,7 @@ def write_headers(path, views, lights, texels, dtype, variance, tile, attributes
     n_views, n_lights = len(views), len(lights)
     tile_rows, tile_columns = min(tile, rows), min(tile, columns)
     n_tiles = -(-rows // tile_rows), -(-columns // tile_columns)
+    shard = shard_shape(n_lights, texels, (tile_rows, tile_columns))
     conventions = {"schema_version": SCHEMA_VERSION, **CONVENTIONS}
     arrays = (("values", dtype), ("variance", "float32")) if variance else (("values", dtype),)
     names = {
@@ -138,7 +175,7 @@ def write_headers(path, views, lights, texels, dtype, variance, tile, attributes
             dtype=kind,
             chunks=(1, 1, tile_rows, tile_columns, 3),
             # A shard holds whole inner chunks, so it may reach beyond the last row and column.
-            shards=(1, n_lights, n_tiles[0] * tile_rows, n_tiles[1] * tile_columns, 3),
+            shards=(1, shard[0], shard[1] * tile_rows, shard[2] * tile_columns, 3),
             compressors=zarr.codecs.Crc32cCodec(),
             fill_value=float("nan"),
             dimension_names=list(AXES),
@@ -152,6 +189,22 @@ def write_headers(path, views, lights, texels, dtype, variance, tile, attributes
         fill_value=0,
         dimension_names=["view", "light", "tile_row", "tile_column"],
     )
+    for name, kind, channels in (
+        ("pilot", "float32", 3),
+        ("samples", "uint32", 0),
+        ("reached", "float32", 2),
+    ):
+        if not adaptive:
+            break
+        last = (channels,) if channels else ()
+        group.create_array(
+            name,
+            shape=(n_views, rows, columns, *last),
+            dtype=kind,
+            chunks=(1, rows, columns, *last),
+            compressors=zarr.codecs.Crc32cCodec(),
+            fill_value=float("nan") if kind == "float32" else 0,
+        )
     for name, vectors in (("views", views.vectors), ("lights", lights.vectors)):
         array = group.create_array(
             name,
@@ -174,8 +227,12 @@ def remove_leftovers(path):
     path = Path(path)
     if path.absolute().parent.is_dir():
         for draft in path.absolute().parent.iterdir():
-            if draft.name.startswith(path.name + ".") and draft.name.endswith(DRAFT) and draft.is_dir():
+            if not (draft.name.startswith(path.name + ".") and draft.name.endswith(DRAFT)):
+                continue
+            if draft.is_dir():
                 shutil.rmtree(draft, ignore_errors=True)
+            else:
+                draft.unlink(missing_ok=True)
     if path.is_dir():
         for leftover in path.rglob("*" + DRAFT):
             leftover.unlink(missing_ok=True)

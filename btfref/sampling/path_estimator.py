@@ -138,15 +138,20 @@ class PathEstimator:
 
     def _texels(self, first, n_texels, w_view, keys):
         """Statistics of texels first … first + n_texels − 1, as two (n_lit, n_texels, 3) arrays."""
+        self._paths(n_texels * self.spp, first * self.spp, w_view, keys)
+        return self._statistics(len(self.lit), n_texels)
+
+    def _paths(self, n_lanes, first, w_view, keys):
+        """Fill the buffer with the samples of one pass, whose streams begin at `first`."""
         import drjit as dr
         import mitsuba as mi
 
-        n_lanes, n_lit = n_texels * self.spp, len(self.lit)
+        n_lit = len(self.lit)
         if self._buffer is None or dr.width(self._buffer) != 3 * n_lit * n_lanes:
             # Touching new memory costs as much as filling it: one buffer serves all views.
             self._buffer = dr.zeros(mi.Float, 3 * n_lit * n_lanes)
         # Everything that changes between views is opaque: one kernel then serves all of them.
-        first = dr.opaque(mi.UInt32, first * self.spp)
+        first = dr.opaque(mi.UInt32, first)
         n_lanes_opaque = dr.opaque(mi.UInt32, n_lanes)
         lane = dr.arange(mi.UInt32, n_lanes)
         w_view = mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in w_view))
@@ -164,7 +169,10 @@ class PathEstimator:
                 break
             state = tuple(dr.gather(type(value), value, survivors) for value in state)
             vertex += 1
-        return self._statistics(n_lit, n_texels)
+
+    def _stream(self, lane, first):
+        """Number of the random stream of a lane of this pass: the sample's own, whatever the pass."""
+        return lane + first
 
     def _footprint(self, lane, keys, w_view):
         """Start of the view rays: a stratified point of the lane's texel square, moved up along w_view."""
@@ -194,8 +202,8 @@ class PathEstimator:
         context = mi.BSDFContext()
         self._connect(interaction, bsdf, context, throughput, lane, active, n_lanes, first_vertex=number == 1)
 
-        lobe, u, v, _ = uniforms(lane + first, keys, 2 * depth)
-        roulette, _, _, _ = uniforms(lane + first, keys, 2 * depth + 1)
+        lobe, u, v, _ = uniforms(self._stream(lane, first), keys, 2 * depth)
+        roulette, _, _, _ = uniforms(self._stream(lane, first), keys, 2 * depth + 1)
         sample, weight = bsdf.sample(context, interaction, lobe, mi.Point2f(u, v), active)
         throughput = throughput * weight
         survival = dr.minimum(dr.max(throughput), ROULETTE_LIMIT)

@@ -10,6 +10,7 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.directions import checked
+from btfref.sampling.adaptive import summary
 from btfref.sampling.layout import (
     DRAFT,
     KIND,
@@ -21,7 +22,9 @@ from btfref.sampling.layout import (
 )
 
 
-def create_store(path, *, views, lights, texels, dtype="float16", variance=True, tile=TILE, attributes=None):
+def create_store(
+    path, *, views, lights, texels, dtype="float16", variance=True, tile=TILE, attributes=None, adaptive=False
+):
     """An empty store; it appears under its name only when all its headers are there.
 
     Parameters
@@ -39,6 +42,8 @@ def create_store(path, *, views, lights, texels, dtype="float16", variance=True,
         Texels along one side of an inner chunk.
     attributes : dict, optional
         JSON types, beside the conventions: seed, parameters, parent, versions …
+    adaptive : bool
+        Whether the store has the arrays of a synthesis to a target error.
 
     Returns
     -------
@@ -56,7 +61,7 @@ def create_store(path, *, views, lights, texels, dtype="float16", variance=True,
     # A fixed name: what a killed run left is found and removed by the next one.
     draft = path.with_name(path.name + DRAFT)
     shutil.rmtree(draft, ignore_errors=True)
-    write_headers(draft, views, lights, texels, dtype, variance, tile, attributes)
+    write_headers(draft, views, lights, texels, dtype, variance, tile, attributes, adaptive)
     os.rename(draft, path)
     return BTFStore(path)
 
@@ -194,12 +199,32 @@ class BTFStore:
             },
             "complete": bool(covered.all()),
             "has_variance": self.has_variance,
+            "error": summary(self),
             "parameters": self.attributes.get("parameters", {}),
             "parent": self.attributes.get("parent", {}),
             "seed": self.attributes.get("seed"),
             "versions": self.attributes.get("versions", {}),
             "attributes": self.attributes,
         }
+
+    @property
+    def shard(self):
+        """Tile rows and tile columns that one file holds."""
+        shards = self._values.shards
+        sides = (shards or self._values.chunks)[2:4]
+        return tuple(n // size for n, size in zip(sides, self.tile, strict=True))
+
+    def covered(self, view):
+        """Which parts of a view are there: bool, shape (lights, tile rows, tile columns)."""
+        return self._guard("coverage", lambda: self._coverage[int(view)]) == 1
+
+    def write_map(self, name, view, values):
+        """Write a view of an array that `maps` gives."""
+        self._guard(name, lambda: self.maps(name).__setitem__(int(view), values))
+
+    def maps(self, name):
+        """The Zarr array "pilot", "samples" or "reached" of a store made to a target error, else None."""
+        return self._group[name] if name in self._group else None
 
     def write_view(self, view, values, variance=None):
         """Store one view; it counts as there only when all of it is on disk.
@@ -217,61 +242,95 @@ class BTFStore:
         InputError
             Wrong shape, a value that is not finite, or one beyond the stored type.
         """
-        shape = self._values.shape[1:]
-        if (variance is not None) != self.has_variance:
-            raise InputError(
-                "variance of a view", file=self.path, expected="given" if self.has_variance else "none"
-            )
-        for field, array, target in (
-            ("values", values, self._values),
-            ("variance", variance, self._variance),
-        ):
-            if array is None:
-                continue
-            with np.errstate(over="ignore"):
-                stored = np.ascontiguousarray(array, dtype=target.dtype)
-            if stored.shape != shape:
-                raise InputError("wrong shape", file=self.path, field=field, got=stored.shape, expected=shape)
-            check_finite(stored, self.path, field)
-            self._guard(field, lambda target=target, stored=stored: target.__setitem__(int(view), stored))
-        self._guard("coverage", lambda: self._coverage.__setitem__(int(view), 1))
+        tiles = np.divmod(np.arange(self.coverage_shape[0] * self.coverage_shape[1]), self.coverage_shape[1])
+        self.write_part(view, np.arange(len(self.lights)), tiles, values, variance)
 
-    def write_part(self, view, lights, tiles, values, variance=None):
-        """Store some tiles of some lights of one view; arguments and errors otherwise as of `write_view`.
+    @property
+    def coverage_shape(self):
+        """Tile rows and tile columns of the whole."""
+        return tuple(self._coverage.shape[2:])
+
+    def write_part(self, view, lights, tiles, values, variance=None, *, origin=(0, 0)):
+        """Store some tiles of some lights of one view; errors as of `write_view`.
 
         Parameters
         ----------
+        view : int
         lights : ndarray of int
         tiles : (ndarray, ndarray) of int
             Rows and columns of the tiles.
         values, variance : ndarray, shape (lights chosen, rows, columns, 3)
-            Of whole rows and columns; only the tiles are taken.
+            Texels from `origin` on, up to the last of these tiles at least; only the tiles are taken.
+        origin : tuple of int
+            Row and column of the first texel given.
         """
         if (variance is not None) != self.has_variance:
             raise InputError(
                 "variance of a view", file=self.path, expected="given" if self.has_variance else "none"
             )
+        tiles = np.stack(tiles, 1)
+        end = [min(n, (last + 1) * t) - o for n, last, t, o in zip(
+            self.texels, tiles.max(0), self.tile, origin, strict=True)]  # fmt: skip
         for field, array, target in (
             ("values", values, self._values),
             ("variance", variance, self._variance),
         ):
             if array is None:
                 continue
-            with np.errstate(over="ignore"):
-                stored = np.ascontiguousarray(array, dtype=target.dtype)
-            check_finite(stored, self.path, field)
-            # A view is one file, so it is read and written as a whole; what is not there is NaN.
-            whole = self._guard(field, lambda target=target: target[int(view)])
-            for row, column in zip(*tiles, strict=True):
-                place = tuple(
-                    slice(k * n, (k + 1) * n) for k, n in zip((row, column), self.tile, strict=True)
+            shape = (len(lights), *array.shape[1:3], 3)
+            if array.shape != shape or array.shape[1] < end[0] or array.shape[2] < end[1]:
+                expected = f"({len(lights)}, {end[0]}, {end[1]}, 3)"
+                raise InputError(
+                    "wrong shape", file=self.path, field=field, got=array.shape, expected=expected
                 )
-                whole[lights, *place] = stored[:, *place]
-            self._guard(field, lambda target=target, whole=whole: target.__setitem__(int(view), whole))
+            for shard in np.unique(tiles // self.shard, axis=0):
+                inside = tiles[(tiles // self.shard == shard).all(1)]
+                self._write_shard(target, field, int(view), lights, inside, shard, array, origin)
         marks = self._guard("coverage", lambda: self._coverage[int(view)])
-        for row, column in zip(*tiles, strict=True):
+        for row, column in tiles:
             marks[lights, row, column] = 1
         self._guard("coverage", lambda: self._coverage.__setitem__(int(view), marks))
+
+    def _write_shard(self, target, field, view, lights, tiles, shard, array, origin):
+        """Write tiles of one shard; what the file has beside them is kept."""
+        rows, columns = (
+            slice(k * s * t, min((k + 1) * s * t, n))
+            for k, s, t, n in zip(shard, self.shard, self.tile, self.texels, strict=True)
+        )
+        place = (view, slice(None), rows, columns)
+        within = np.array([rows.start, columns.start])
+        n_tiles = [
+            -(-(part.stop - part.start) // t) for part, t in zip((rows, columns), self.tile, strict=True)
+        ]
+        whole = len(lights) == len(self.lights) and len(tiles) == n_tiles[0] * n_tiles[1]
+
+        def given(texel_rows, texel_columns):
+            part = array[
+                :,
+                texel_rows.start - origin[0] : texel_rows.stop - origin[0],
+                texel_columns.start - origin[1] : texel_columns.stop - origin[1],
+            ]
+            with np.errstate(over="ignore"):
+                stored = np.ascontiguousarray(part, dtype=target.dtype)
+            check_finite(stored, self.path, field)
+            return stored
+
+        if whole:
+            block = given(rows, columns)
+        else:
+            # What is not there is NaN.
+            block = self._guard(field, lambda: target[place])
+            for tile in tiles:
+                texels = [
+                    slice(k * t, min((k + 1) * t, n))
+                    for k, t, n in zip(tile, self.tile, self.texels, strict=True)
+                ]
+                there = [
+                    slice(part.start - first, part.stop - first)
+                    for part, first in zip(texels, within, strict=True)
+                ]
+                block[lights, there[0], there[1]] = given(*texels)
+        self._guard(field, lambda: target.__setitem__(place, block))
 
     def read(self, *, views=None, lights=None, rows=None, columns=None, variance=True):
         """Read a part; only the chunks that hold it are touched.

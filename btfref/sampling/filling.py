@@ -1,0 +1,214 @@
+"""Fill views of a store, within a budget of memory: what a single process does, alone or as one of many.
+
+What is made together, in which order and by which process has no influence on any byte.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from btfref.sampling import adaptive
+from btfref.sampling.memory import blocks
+from btfref.sampling.part import Part
+from btfref.sampling.variant import mitsuba_variant
+
+#: Streams of random numbers of a synthesis to a target error.
+_PILOT, _ESTIMATE = 1, 2
+
+
+def fill(job, store, views, *, stage, only=None, plan=None, memory, done=None):
+    """Make what is missing of some views.
+
+    Parameters
+    ----------
+    job : Job
+    store : BTFStore
+    views : sequence of int
+    stage : {"pilot", "synthesis"}
+        What is made: the pilot of a synthesis to a target error, or values.
+    only : Part, optional
+        Lights and tiles that are wanted; all when not given. Pilots are made of everything.
+    plan : Plan, optional
+        Of a synthesis to a target error.
+    memory : int
+        Budget of this process, bytes.
+    done : callable, optional
+        Called as ``done(view)`` after each view.
+
+    Raises
+    ------
+    InputError
+        A budget that is too small, or a value that cannot be stored.
+    """
+    views = [int(view) for view in views]
+    if not views:
+        return
+    shard = tuple(a * b for a, b in zip(store.shard, store.tile, strict=True))
+    size = blocks(
+        memory,
+        estimator=job.estimator,
+        triangles=sum(len(part.faces) for part in job.mesostructure.parts),
+        n_views=len(views),
+        n_lights=len(job.lights),
+        texels=job.texels,
+        shard=shard,
+        spp=job.spp if job.target_error is None else adaptive.SURFACE_POINTS,
+        # Means over all lights decide how many passes there are: they are made at once.
+        split_lights=job.target_error is None,
+    )
+    work = {
+        ("path", "pilot"): _pilot_by_texels,
+        ("path", "synthesis"): _fill_by_texels,
+        ("surface", "pilot"): _pilot_by_views,
+        ("surface", "synthesis"): _fill_by_views if plan is None else _fill_by_passes,
+    }[job.estimator, stage]
+    with mitsuba_variant(job.variant):
+        for view in work(job, store, views, only or Part(), plan, size):
+            if done is not None:
+                done(view)
+
+
+def _regions(store):
+    """Texels of one file each: (rows, columns) of texels as slices, and its tiles."""
+    rows, columns = store.coverage_shape
+    for first_row in range(0, rows, store.shard[0]):
+        for first_column in range(0, columns, store.shard[1]):
+            last = min(first_row + store.shard[0], rows), min(first_column + store.shard[1], columns)
+            tiles = np.mgrid[first_row : last[0], first_column : last[1]].reshape(2, -1)
+            sides = [
+                slice(a * t, min(b * t, n))
+                for a, b, t, n in zip((first_row, first_column), last, store.tile, store.texels, strict=True)
+            ]
+            yield sides, tiles
+
+
+# --- paths: texel by texel
+
+
+def _fill_by_texels(job, store, views, only, plan, size):
+    _, lights, tiles = only.indices(store)
+    wanted = np.zeros(store.coverage_shape, bool)
+    wanted[tiles] = True
+    estimator = job.make_estimator(views, lights=lights, buffer=size.buffer)
+    columns = store.texels[1]
+    for view in views:
+        missing = wanted & ~store.covered(view)[lights].all(0)
+        counts = None
+        if plan is not None:
+            counts = plan.counts(store.maps("pilot")[view])
+            store.write_map("samples", view, counts)
+        for (row, column), region in _regions(store):
+            chosen = region[:, missing[tuple(region)]]
+            if not chosen.shape[1]:
+                continue
+            inside = missing[np.ix_(_tile_of(row, store.tile[0]), _tile_of(column, store.tile[1]))]
+            at = np.argwhere(inside)
+            texel = (row.start + at[:, 0]) * columns + column.start + at[:, 1]
+            shape = (len(lights), row.stop - row.start, column.stop - column.start, 3)
+            result = []
+            for values in estimator.estimate(
+                view, texel, *(() if plan is None else (counts.ravel()[texel], (_ESTIMATE,)))
+            ):
+                if len(at) < inside.size:
+                    whole = np.zeros(shape, np.float32)
+                    whole[:, at[:, 0], at[:, 1]] = values
+                    values = whole
+                result.append(values.reshape(shape))
+            if plan is not None:
+                _record_part(store, view, row, column, inside, adaptive.texel_means(*result))
+            store.write_part(view, lights, tuple(chosen), *result, origin=(row.start, column.start))
+        yield view
+
+
+def _tile_of(part, side):
+    return np.arange(part.start, part.stop) // side
+
+
+def _pilot_by_texels(job, store, views, only, plan, size):
+    estimator = job.make_estimator(views, buffer=size.buffer)
+    columns = store.texels[1]
+    for view in views:
+        pilot = np.zeros((*store.texels, 3), np.float32)
+        for (row, column), _ in _regions(store):
+            texel = (np.arange(row.start, row.stop)[:, None] * columns + np.arange(columns)[column]).ravel()
+            counts = np.full(len(texel), adaptive.PILOT)
+            pilots = [estimator.estimate(view, texel, counts, (_PILOT, k)) for k in (0, 1)]
+            found = adaptive.pilot_map(*pilots, adaptive.PILOT)
+            pilot[row, column] = found.reshape(row.stop - row.start, column.stop - column.start, 3)
+        store.write_map("pilot", view, pilot)
+        yield view
+
+
+# --- surface points: whole views
+
+
+def _fill_by_views(job, store, views, only, plan, size):
+    _, lights, tiles = only.indices(store)
+    mask = None if len(tiles[0]) == np.prod(store.coverage_shape) else only.mask(store)
+    for group in _groups(views, size.views):
+        for chosen in _groups(lights, size.lights):
+            chosen = np.asarray(chosen)
+            estimator = job.make_estimator(group, lights=chosen, mask=mask)
+            for view, mean, variance in estimator.all_views(group):
+                store.write_part(view, chosen, tiles, mean, variance)
+                if len(chosen) == len(lights):
+                    yield view
+            del estimator
+        if size.lights < len(lights):
+            yield from group
+
+
+def _groups(items, size):
+    return [items[first : first + size] for first in range(0, len(items), size)]
+
+
+def _passes(job, group, passes):
+    """Sums over passes of independent points: (view, mean, variance of the mean) of each view."""
+    sums = {view: None for view in group}
+    for number in range(max(passes.values())):
+        still = [view for view in group if passes[view] > number]
+        estimator = job.make_estimator(still, spp=adaptive.SURFACE_POINTS, stream=(_ESTIMATE, number))
+        for view, mean, variance in estimator.all_views(still):
+            if sums[view] is None:
+                sums[view] = [mean.copy(), variance.copy()]
+            else:
+                sums[view][0] += mean
+                sums[view][1] += variance
+        del estimator
+        for view in group:
+            if passes[view] == number + 1:
+                mean, variance = sums.pop(view)
+                yield view, mean / np.float32(passes[view]), variance / np.float32(passes[view] ** 2)
+
+
+def _fill_by_passes(job, store, views, only, plan, size):
+    _, lights, tiles = only.indices(store)
+    counts = {view: plan.counts(store.maps("pilot")[view]) for view in views}
+    passes = {view: int(counts[view].max()) for view in views}
+    # Views of alike numbers of passes go together, so that most passes are of all views of their group.
+    order = sorted(views, key=lambda view: (passes[view], view))
+    for group in _groups(order, size.views):
+        for view in group:
+            store.write_map("samples", view, counts[view] * adaptive.SURFACE_POINTS)
+        for view, mean, variance in _passes(job, group, passes):
+            store.write_map("reached", view, adaptive.texel_means(mean, variance))
+            store.write_part(view, lights, tiles, mean, variance)
+            yield view
+
+
+def _pilot_by_views(job, store, views, only, plan, size):
+    for group in _groups(views, size.views):
+        estimator = job.make_estimator(group, spp=adaptive.SURFACE_POINTS, stream=(_PILOT, 0))
+        for view, mean, variance in estimator.all_views(group):
+            # Sums over a view are what matters here: one pilot will do for both.
+            store.write_map("pilot", view, adaptive.pilot_map((mean, variance), (mean, variance), 1))
+            yield view
+        del estimator
+
+
+def _record_part(store, view, row, column, inside, means):
+    """Note what was reached in some texels of a view; the others keep what is known of them."""
+    whole = store.maps("reached")[view]
+    part = whole[row, column]
+    whole[row, column] = np.where(inside[..., None], means, part)
+    store.write_map("reached", view, whole)

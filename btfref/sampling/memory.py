@@ -1,0 +1,128 @@
+"""How much of a BTF is made at once, so that a process stays within a budget of memory."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+from btfref.errors import InputError
+
+#: Bytes of a process that holds nothing of the BTF yet: interpreter, Mitsuba, kernels, scene of a small tile.
+BASE = 450 << 20
+
+#: Bytes per value (view, light, texel, channel) of what is made together: mean and variance as computed, as
+#: stored, and Zarr's encoded shards of both.
+PER_VALUE = 28
+
+#: Peak of a pass of paths in sizes of its sample buffer: the samples, their squares and what is summed.
+BUFFERS = 4
+
+#: Smallest and largest sample buffer worth having, bytes.
+BUFFER_RANGE = (8 << 20, 96 << 20)
+
+#: Bytes per vertex and face of the geometry: ours, Mitsuba's and the acceleration structure's.
+PER_TRIANGLE = 400
+
+#: Surface points, bytes per point: geometry and walks; per point and light: table of light; per point and
+#: direction: visibility and bins.
+PER_POINT, PER_POINT_LIGHT, PER_POINT_DIRECTION = 600, 24, 8
+
+#: Bytes of the surface estimator's walk buffers and pilot, whatever the size of the BTF.
+SURFACE_BASE = 700 << 20
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """What is made together.
+
+    Attributes
+    ----------
+    buffer : int
+        Bytes of the sample buffer of the path estimator.
+    views, lights : int
+        Views and lights that the surface estimator makes together.
+    """
+
+    buffer: int
+    views: int
+    lights: int
+
+
+def default_budget():
+    """Half of the machine's memory, bytes."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+
+
+def peak():
+    """Largest amount of memory (bytes) that this process ever had in use."""
+    import resource
+    import sys
+
+    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return used if sys.platform == "darwin" else used * 1024
+
+
+def blocks(budget, *, estimator, triangles, n_views, n_lights, texels, shard, spp, split_lights=True):
+    """Largest blocks within a budget; they have no influence on any result.
+
+    Parameters
+    ----------
+    budget : int
+        Bytes of the whole process.
+    estimator : str
+        "path" or "surface".
+    triangles : int
+        Of the geometry.
+    n_views, n_lights : int
+        Views to be made and all lights.
+    texels : tuple of int
+        Rows and columns of the tile.
+    shard : tuple of int
+        Rows and columns of texels of one file of the store.
+    spp : int
+        Samples, or points, per texel.
+    split_lights : bool
+        Whether lights may be made in several goes.
+
+    Returns
+    -------
+    Blocks
+
+    Raises
+    ------
+    InputError
+        Even the smallest blocks need more.
+    """
+    free = budget - BASE - triangles * PER_TRIANGLE
+    if estimator == "path":
+        values = 3 * n_lights * min(shard[0], texels[0]) * min(shard[1], texels[1])
+        buffer = (free - values * PER_VALUE) // BUFFERS
+        if buffer < BUFFER_RANGE[0]:
+            _refuse(budget, budget - free + values * PER_VALUE + BUFFERS * BUFFER_RANGE[0])
+        return Blocks(min(buffer, BUFFER_RANGE[1]), 1, n_lights)
+    free -= SURFACE_BASE
+    points = spp * texels[0] * texels[1]
+
+    def need(views, lights):
+        values = 3 * lights * texels[0] * texels[1]
+        directions = (views + lights) * PER_POINT_DIRECTION
+        return values * PER_VALUE + points * (PER_POINT + lights * PER_POINT_LIGHT + directions)
+
+    # Views first: walks from the surface serve all views that are made together, and lights part them least.
+    parts = range(1, n_lights + 1) if split_lights else (1,)
+    for lights in sorted({-(-n_lights // k) for k in parts}, reverse=True):
+        for views in sorted({-(-n_views // k) for k in (1, 2, 3, 4, 6, 8)}, reverse=True):
+            if need(views, lights) <= free:
+                return Blocks(BUFFER_RANGE[1], views, lights)
+        if need(1, lights) <= free:
+            return Blocks(BUFFER_RANGE[1], 1, lights)
+    return _refuse(budget, budget - free + need(1, lights))
+
+
+def _refuse(budget, least):
+    raise InputError(
+        "memory budget too small for these settings",
+        field="memory",
+        got=f"{budget / 2**20:.0f} MiB",
+        expected=f"at least {least / 2**20:.0f} MiB",
+    )

@@ -1,0 +1,213 @@
+"""Who fills a store: this process, or the workers of a Dask cluster; the bytes are the same."""
+
+from __future__ import annotations
+
+import contextlib
+import pickle
+import threading
+from pathlib import Path
+
+from btfref.errors import InputError, MissingDependencyError
+from btfref.sampling.filling import fill
+from btfref.sampling.layout import DRAFT
+from btfref.sampling.memory import default_budget, peak
+from btfref.sampling.store import open_store
+
+#: Tasks per worker: enough that a slow or lost worker costs little, few enough that scenes are not built for nothing.
+TASKS_PER_WORKER = 6
+
+#: One synthesis at a time in a process: Mitsuba's threads use all that the worker may use.
+_LOCK = threading.Lock()
+
+
+def run(
+    job,
+    store,
+    views,
+    *,
+    stage,
+    only=None,
+    plan=None,
+    memory=None,
+    scheduler=None,
+    workers=None,
+    progress=None,
+):
+    """Fill views of a store; see `btfref.sampling.filling.fill`.
+
+    Parameters
+    ----------
+    job, store, views, stage, only, plan
+        As for `fill`.
+    memory : int, optional
+        Budget in bytes of this process and of all workers that it starts together, or of each worker of a
+        cluster that runs elsewhere; by default half of the machine's memory.
+    scheduler : None, str or distributed.Client
+        None: this process. "dask": a local cluster. An address such as "tcp://10.0.0.1:8786", or a client: that
+        cluster, whose workers must see the store under the same name and run the same versions.
+    workers : int, optional
+        Of a local cluster; by default one per two processors.
+    progress : callable, optional
+        Called as ``progress(done, total, label)`` after each view.
+
+    Returns
+    -------
+    int
+        Largest memory (bytes) of any process that worked.
+
+    Raises
+    ------
+    InputError
+        A budget that is too small, a scheduler that cannot be reached, or a worker that does not see the store.
+    MissingDependencyError
+        Dask is not installed.
+    """
+    views = [int(view) for view in views]
+    total, finished = len(views), [0]
+
+    def done(n):
+        finished[0] += n
+        if progress is not None:
+            progress(finished[0], total, stage)
+
+    if scheduler is None:
+        memory = default_budget() if memory is None else memory
+        fill(job, store, views, stage=stage, only=only, plan=plan, memory=memory, done=lambda view: done(1))
+        return peak()
+    if not views:
+        return peak()
+    with _client(scheduler, workers, memory) as (client, settings):
+        return max(peak(), _distribute(client, job, store, views, stage, only, plan, settings, done))
+
+
+@contextlib.contextmanager
+def _client(scheduler, workers, memory):
+    """A client, and what its workers are told: budget and threads of each."""
+    try:
+        import distributed
+    except ImportError:
+        raise MissingDependencyError(
+            "Dask is not installed, which a scheduler needs", "pip install 'btfref[distributed]'"
+        ) from None
+    import logging
+    import os
+
+    if isinstance(scheduler, distributed.Client):
+        yield scheduler, {"memory": memory, "threads": None}
+        return
+    if scheduler == "dask":
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        count = max(1, cores // 2) if workers is None else int(workers)
+        if count < 1:
+            raise InputError(
+                "workers of a local cluster", field="workers", got=workers, expected="at least 1"
+            )
+        budget = default_budget() if memory is None else memory
+        with (
+            distributed.LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address=None,
+                memory_limit=0,  # the budget is kept by what is made together, not by killing
+                silence_logs=logging.CRITICAL,
+            ) as cluster,
+            distributed.Client(cluster) as client,
+        ):
+            yield client, {"memory": budget // count, "threads": max(1, cores // count)}
+        return
+    if not isinstance(scheduler, str) or "://" not in scheduler:
+        raise InputError(
+            "scheduler",
+            field="scheduler",
+            got=repr(scheduler),
+            expected="dask, or an address such as tcp://…",
+        )
+    try:
+        client = distributed.Client(scheduler, timeout=20)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise InputError("cannot reach the scheduler", field="scheduler", got=scheduler) from error
+    with client:
+        yield client, {"memory": memory, "threads": None}
+
+
+def _distribute(client, job, store, views, stage, only, plan, settings, done):
+    """Hand the views out; what a lost worker had not finished goes to another."""
+    import distributed
+
+    count = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
+    if job.estimator == "surface":
+        # Points and their walks serve all views of a task: as few tasks as there are workers.
+        size = -(-len(views) // count)
+    else:
+        size = max(1, len(views) // (count * TASKS_PER_WORKER))
+    # Beside the store, where workers must be able to read anyway: what one process holds may be lost with it.
+    order = store.path.with_name(f"{store.path.name}.job{DRAFT}")
+    order.write_bytes(pickle.dumps((job, only, plan)))
+    try:
+        tasks = [
+            client.submit(
+                _work,
+                str(order.resolve()),
+                str(store.path.resolve()),
+                views[first : first + size],
+                stage,
+                settings,
+                pure=False,
+                retries=2,
+            )
+            for first in range(0, len(views), size)
+        ]
+        largest = 0
+        try:
+            for future in distributed.as_completed(tasks):
+                count, used = future.result()
+                largest = max(largest, used)
+                done(count)
+        except distributed.scheduler.KilledWorker as error:
+            raise InputError(
+                "workers were lost again and again; start the same command again to go on",
+                file=store.path,
+                got=str(error).partition("\n")[0],
+            ) from None
+        finally:
+            client.cancel(tasks)
+        return largest
+    finally:
+        order.unlink(missing_ok=True)
+
+
+def _work(order, path, views, stage, settings):
+    """What a worker does: fill its views; the number of views and the worker's largest memory."""
+    from distributed import get_worker
+
+    with _LOCK:
+        if not Path(order).is_file():
+            raise InputError(
+                "a worker does not see the store", file=path, expected="the same path everywhere"
+            )
+        job, only, plan = pickle.loads(Path(order).read_bytes())
+        store = open_store(path)
+        _use_threads(job, settings["threads"] or get_worker().state.nthreads)
+        memory = default_budget() if settings["memory"] is None else settings["memory"]
+        fill(
+            job,
+            store,
+            job.unfinished(store, views, stage, only),
+            stage=stage,
+            only=only,
+            plan=plan,
+            memory=memory,
+        )
+        return len(views), peak()
+
+
+def _use_threads(job, threads):
+    """Tell Dr.Jit how many threads this worker may use."""
+    from btfref.sampling.variant import mitsuba_variant
+
+    with mitsuba_variant(job.variant):
+        import drjit as dr
+
+        if dr.thread_count() != threads:
+            dr.set_thread_count(threads)
