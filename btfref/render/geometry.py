@@ -266,7 +266,8 @@ def _parent(filename):
 
 
 def _mesostructure(plane, parent, given):
-    from btfref.mesostructure import build
+    from btfref.mesostructure import FROM_FILES, build
+    from btfref.sampling.job import fingerprint
 
     if given is not None:
         return build(given)
@@ -277,7 +278,14 @@ def _mesostructure(plane, parent, given):
             field="parent",
             expected="a synthetic BTF",
         )
-    return build(parent["name"], **parent.get("parameters", {}))
+    built = build(parent["name"], **parent.get("parameters", {}))
+    if parent["name"] in FROM_FILES and fingerprint(built) != parent.get("geometry"):
+        raise InputError(
+            "the file that the BTF was made from has changed",
+            file=parent["parameters"]["file"],
+            field="geometry",
+        )
+    return built
 
 
 def _sensor(mi, camera):

@@ -107,7 +107,7 @@ class Job:
                 "kind": "mesostructure",
                 "name": self.mesostructure.name,
                 "parameters": self.mesostructure.parameters,
-                "geometry": _digest(self.mesostructure),
+                "geometry": fingerprint(self.mesostructure),
             },
             "versions": versions(VERSIONS),
         }
@@ -241,8 +241,17 @@ def _share(name, value):
     return float(value)
 
 
-def _digest(mesostructure):
-    """Fingerprint of geometry and materials: a user's mesh has no parameters that say what it is."""
+def fingerprint(mesostructure):
+    """What geometry, materials and textures come to: a user's files may change under their names.
+
+    Parameters
+    ----------
+    mesostructure : Mesostructure
+
+    Returns
+    -------
+    str
+    """
     state = hashlib.sha256()
     for part in mesostructure.parts:
         state.update(json.dumps(part.bsdf, sort_keys=True).encode())

@@ -135,7 +135,7 @@ def _distribute(client, job, store, views, stage, only, plan, settings, done):
     """Hand the views out; what a lost worker had not finished goes to another."""
     import distributed
 
-    count = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
+    count = max(1, len(client.nthreads()))
     if job.estimator == "surface":
         # Points and their walks serve all views of a task: as few tasks as there are workers.
         size = -(-len(views) // count)

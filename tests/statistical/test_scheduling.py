@@ -137,7 +137,7 @@ synthesize_store(sys.argv[1], "checker", texels=int(sys.argv[4]), views=views, l
 
 
 @pytest.mark.parametrize(
-    ("estimator", "texels", "spp", "budget"), [("path", 256, 2, 1000), ("surface", 64, 16, 1500)]
+    ("estimator", "texels", "spp", "budget"), [("path", 256, 2, 1000), ("surface", 48, 16, 1400)]
 )
 def test_the_budget_is_kept(tmp_path, estimator, texels, spp, budget):
     """The budget bounds the process that does the work; 256² · 151² as a whole would be 17 GB."""
