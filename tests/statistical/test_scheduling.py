@@ -136,6 +136,7 @@ synthesize_store(sys.argv[1], "checker", texels=int(sys.argv[4]), views=views, l
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("estimator", "texels", "spp", "budget"), [("path", 256, 2, 1000), ("surface", 48, 16, 1400)]
 )
