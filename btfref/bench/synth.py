@@ -26,9 +26,22 @@ METHODS = {
     "naive 16": ("naive", 16),
     "naive 64": ("naive", 64),
     "path 16": ("path", 16),
+    "path 64": ("path", 64),
+    "surface 8": ("surface", 8),
     "surface 16": ("surface", 16),
     "surface 32": ("surface", 32),
 }
+
+#: Growth of the cost: what is varied -> its values. The others stay at `BASE`.
+GROWTH = {
+    "texels": (32, 64, 128, 256),
+    "directions": ("5x5", "ubo81", "ubo151"),
+    "max_depth": (2, 3, 4, 8),
+}
+BASE = {"mesostructure": "checker", "texels": 64, "directions": "ubo81", "max_depth": 8, "spp": 8}
+
+#: Views of the slow shared-path estimator that stand for all of them in its time.
+PATH_VIEWS = 8
 
 PAIRS, SEEDS, MAX_DEPTH, REFERENCE_SPP = 12, 3, 8, 2048
 
@@ -45,37 +58,51 @@ def run(*, quick=False, progress=None, only=None, btf=None):
         The checker at 16² texels, one round.
     progress : callable, optional
     only : iterable of str, optional
-        Mesostructures instead of all.
+        Mesostructures instead of all; "growth" for the growth of the cost alone.
     btf : SampledBTF, optional
         Not used.
 
     Returns
     -------
     dict
-        ``raw``: seconds of every round per mesostructure and method; ``errors``; ``peak_bytes``;
-        ``parameters``; ``machine``.
+        ``raw``: seconds of every round per mesostructure and method; ``kernel_s``, those of the naive loop
+        that its kernels take; ``errors``; ``peak_bytes``; ``growth``: one row per setting; ``parameters``;
+        ``machine``.
     """
-    names = list(only or (("checker",) if quick else MESOSTRUCTURES))
+    names = list(only or (("checker",) if quick else (*MESOSTRUCTURES, "growth")))
+    growing = "growth" in names
+    names = [name for name in names if name != "growth"]
     rounds, texels = (1, 16) if quick else (3, 64)
     result = {"raw": {}, "errors": {}, "peak_bytes": {}, "kernel_s": {}}
-    total, done = len(names) * (1 + rounds * len(METHODS)), 0
+    settings = _growing(quick) if growing else []
+    total, done = len(names) * (1 + rounds * len(METHODS)) + len(settings), 0
     with tempfile.TemporaryDirectory() as folder:
         for name in names:
             reference = Path(folder) / f"{name}.npz"
             _child({"task": "reference", "mesostructure": name, "texels": texels, "out": str(reference)})
             done += 1
-            raw, errors, peak = {}, {}, {}
+            raw, errors, peak, kernels = {}, {}, {}, {}
             for seed in range(rounds):
                 for label, (method, spp) in METHODS.items():
                     job = {"task": method, "mesostructure": name, "texels": texels, "spp": spp, "seed": seed}
                     answer = _child(job | {"reference": str(reference)})
                     raw.setdefault(label, []).append(answer["seconds"])
                     errors.setdefault(label, []).append(answer["errors"])
+                    if "kernel_s" in answer:
+                        kernels.setdefault(label, []).append(answer["kernel_s"])
                     peak[label] = max(peak.get(label, 0), answer["peak_bytes"])
                     done += 1
                     if progress is not None:
                         progress(done, total, f"{name}, {label}")
             result["raw"][name], result["errors"][name], result["peak_bytes"][name] = raw, errors, peak
+            result["kernel_s"][name] = kernels
+    growth = []
+    for setting in settings:
+        growth.append(setting | _child({"task": "growth", **setting}))
+        done += 1
+        if progress is not None:
+            progress(done, total, "growth of the cost")
+    result["growth"] = growth
     parameters = {
         "texels": texels,
         "directions": "ubo81 × ubo81",
@@ -86,6 +113,13 @@ def run(*, quick=False, progress=None, only=None, btf=None):
         "naive_pairs": NAIVE_PAIRS,
     }
     return {"suite": "synth", "parameters": parameters, "machine": machine(), **result}
+
+
+def _growing(quick):
+    """Settings of the growth of the cost."""
+    base = BASE | ({"texels": 16} if quick else {})
+    rows = [base | {"varied": name, name: value} for name, values in GROWTH.items() for value in values]
+    return [row for row in rows if not quick or row["texels"] <= 32]
 
 
 def table(result):
@@ -99,19 +133,33 @@ def table(result):
         "MAE",
         "|z| of means",
         "× naive 16",
+        "× its kernels",
         "MiB",
     ]
     rows = []
     for name, raw in result["raw"].items():
         naive = statistics.median(raw["naive 16"])
+        kernels = statistics.median(result["kernel_s"][name]["naive 16"])
         for label, seconds in raw.items():
             errors = result["errors"][name][label]
             column = [statistics.median(e[key] for e in errors) for key in ("rmse", "trimmed", "mae")]
             z = max(e["z"] for e in errors)
             time = statistics.median(seconds)
             peak = result["peak_bytes"][name][label] / 2**20
-            numbers = (*(f"{e:.4f}" for e in column), f"{z:.1f}", f"{naive / time:.1f}", f"{peak:.0f}")
-            rows.append([name, label, f"{time:.2f}", *numbers])
+            numbers = (*(f"{e:.4f}" for e in column), f"{z:.1f}", f"{naive / time:.1f}")
+            rows.append([name, label, f"{time:.2f}", *numbers, f"{kernels / time:.1f}", f"{peak:.0f}"])
+    for row in result["growth"]:
+        setting = f"surface {row['spp']}, {row['texels']}², {row['n_directions']}², depth {row['max_depth']}"
+        blank = [""] * 6
+        rows.append(
+            [
+                row["mesostructure"],
+                setting,
+                f"{row['seconds']:.2f}",
+                *blank,
+                f"{row['peak_bytes'] / 2**20:.0f}",
+            ]
+        )
     return header, rows
 
 
@@ -236,7 +284,10 @@ def _task(job):
     from btfref.sampling.synthesis import synthesize
     from btfref.sampling.variant import mitsuba_variant
 
+    if job["task"] == "growth":
+        return _growth(job)
     vectors, texels = directions("ubo81").vectors, job["texels"]
+    kernel_s = None
     chosen = pairs(len(vectors), len(vectors))
     if job["task"] in ("naive", "reference"):
         with mitsuba_variant("llvm_ad_rgb") as mi:
@@ -256,12 +307,20 @@ def _task(job):
                 return {}
             rng = np.random.default_rng(job["seed"])
             some = rng.integers(0, len(vectors), (NAIVE_PAIRS + 3, 2))
-            times = []
+            import drjit as dr
+
+            times, kernels = [], []
             for i, (v, k) in enumerate(some):
                 start = time.perf_counter()
                 render(vectors[v], vectors[k], job["spp"], i)
                 times.append(time.perf_counter() - start)
             seconds = statistics.mean(times[3:]) * len(vectors) ** 2
+            with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+                for i, (v, k) in enumerate(some):
+                    dr.kernel_history_clear()
+                    render(vectors[v], vectors[k], job["spp"], i)
+                    kernels.append(sum(entry["execution_time"] for entry in dr.kernel_history()))
+            kernel_s = statistics.mean(kernels[3:]) / 1e3 * len(vectors) ** 2
             values = np.stack(
                 [
                     render(vectors[v], vectors[k], job["spp"], 77 + job["seed"] * 100 + i)
@@ -270,16 +329,47 @@ def _task(job):
             )
     else:
         settings = {"texels": texels, "spp": job["spp"], "estimator": job["task"], "max_depth": MAX_DEPTH}
-        # Warm kernels; a path takes long, and its kernels are warm after some views.
+        # Warm kernels; a path takes long, its views cost about the same and its kernels are warm after some.
+        path = job["task"] == "path"
+        everything = np.unique(np.concatenate([chosen[:, 0], np.linspace(0, 80, PATH_VIEWS).astype(int)]))
+        used = everything if path else np.arange(len(vectors))
         for warm in (True, False):
-            views = vectors[:4] if warm and job["task"] == "path" else vectors
+            views = vectors[used[:4]] if warm and path else vectors[used]
             start = time.perf_counter()
-            btf = synthesize(job["mesostructure"], views=views, seed=job["seed"], dtype="float32", **settings)
-            seconds = time.perf_counter() - start
-        values = btf.values[chosen[:, 0], chosen[:, 1]]
+            btf = synthesize(job["mesostructure"], views=views, lights=vectors, seed=job["seed"],
+                             dtype="float32", **settings)  # fmt: skip
+            seconds = (time.perf_counter() - start) * len(vectors) / len(views)
+        values = btf.values[np.searchsorted(used, chosen[:, 0]), chosen[:, 1]]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     with np.load(job["reference"]) as data:
-        return {"seconds": seconds, "peak_bytes": peak, "errors": _errors(values.astype(np.float64), data)}
+        answer = {"seconds": seconds, "peak_bytes": peak, "errors": _errors(values.astype(np.float64), data)}
+    return answer if kernel_s is None else answer | {"kernel_s": kernel_s}
+
+
+def _growth(job):
+    """Time and memory of one setting, results not kept: what a store would be given view by view."""
+    import resource
+    import time
+
+    from btfref.mesostructure import build
+    from btfref.numerics.directions import directions
+    from btfref.sampling.surface_estimator import SurfaceEstimator
+    from btfref.sampling.variant import mitsuba_variant
+
+    vectors = directions(job["directions"]).vectors
+    tile = build(job["mesostructure"])
+    with mitsuba_variant("llvm_ad_rgb"):
+        for texels in (16, job["texels"]):
+            start = time.perf_counter()
+            estimator = SurfaceEstimator(
+                tile, vectors, views=vectors, texels=(texels, texels), spp=job["spp"], seed=0,
+                max_depth=job["max_depth"],
+            )  # fmt: skip
+            for _ in estimator.all_views(range(len(vectors))):
+                pass
+            seconds = time.perf_counter() - start
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return {"seconds": seconds, "peak_bytes": peak, "n_directions": len(vectors)}
 
 
 if __name__ == "__main__":

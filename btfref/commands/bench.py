@@ -9,6 +9,7 @@ from pathlib import Path
 
 from btfref.bench import SUITES
 from btfref.commands._shared import Progress, emit, emit_json, output_file, table
+from btfref.errors import InputError
 
 
 def add_arguments(parser):
@@ -18,6 +19,7 @@ def add_arguments(parser):
     parser.add_argument("--btf", metavar="BTF", help="a sampled BTF (.btf.zarr) instead of the suite's own")
     parser.add_argument("--only", metavar="METHOD[,METHOD]", help="these methods instead of all")
     parser.add_argument("-o", "--output", metavar="FILE.jsonl", help="append the raw result as one JSON line")
+    parser.add_argument("--plot", metavar="FILE.png", help="draw how the cost grows (suite synth)")
     parser.add_argument("--json", action="store_true", help="print the raw result as JSON")
 
 
@@ -27,6 +29,9 @@ def run(args):
     import json
 
     out = output_file(args.output, ".jsonl") if args.output else None
+    plot = output_file(args.plot, ".png") if args.plot else None
+    if plot and args.suite != "synth":
+        raise InputError("only the suite synth is drawn", field="--plot", got=args.suite, expected="synth")
     suite = importlib.import_module(SUITES[args.suite])
     options = {"only": args.only.split(",")} if args.only else {}
     if args.btf:
@@ -38,6 +43,10 @@ def run(args):
     if out:
         with Path(out).open("a") as stream:
             stream.write(json.dumps(result) + "\n")
+    if plot:
+        from btfref.report.growth_plot import plot_growth
+
+        plot_growth(result["growth"], plot)
     if args.json:
         emit_json(result)
         return 0

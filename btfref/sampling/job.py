@@ -14,6 +14,7 @@ from btfref.mesostructure import build
 from btfref.mesostructure.materials import load_bsdf
 from btfref.numerics.directions import directions
 from btfref.sampling import adaptive
+from btfref.sampling.fallback import reason_against_surface
 from btfref.sampling.layout import TILE, remove_leftovers
 from btfref.sampling.part import Part
 from btfref.sampling.resume import resumable
@@ -90,8 +91,10 @@ class Job:
         self.views, self.lights = directions(views), directions(lights)
         self.mesostructure = build(mesostructure, **parameters)
         with mitsuba_variant(variant):
-            for part in self.mesostructure.parts:
-                load_bsdf(part)
+            bsdfs = [load_bsdf(part) for part in self.mesostructure.parts]
+            fallback = reason_against_surface(bsdfs) if estimator == "surface" else None
+        if fallback is not None:
+            estimator = self.estimator = "path"
         self.attributes = {
             "seed": self.seed,
             "estimator": estimator,
@@ -111,6 +114,8 @@ class Job:
             },
             "versions": versions(VERSIONS),
         }
+        if fallback is not None:
+            self.attributes["fallback"] = f"path instead of surface: {fallback}"
         if self.target_error is not None:
             self.attributes["parameters"] |= {
                 "target_error": self.target_error,

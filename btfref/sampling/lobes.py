@@ -38,14 +38,12 @@ class BroadLobes:
         self.ids = [int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]) for bsdf in bsdfs]
         size = max(self.ids) + 1
         tables, kind = np.ones((size, N_TABLE)), np.zeros(size)
-        transmissive = np.zeros(size)
         diffuse = int(mi.BSDFFlags.DiffuseReflection)
         everything = int(mi.BSDFContext().type_mask)
         self.full, self.diffuse, self.rest = (mi.BSDFContext() for _ in range(3))
         self.diffuse.type_mask = diffuse
         self.rest.type_mask = everything & ~diffuse
         for index, bsdf in zip(self.ids, bsdfs, strict=True):
-            transmissive[index] = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
             if not mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection):
                 continue
             table = self._separated(bsdf)
@@ -57,7 +55,7 @@ class BroadLobes:
         self.masked = bool((used != 1).all() and (used == 2).any())
         self.any = bool((used > 0).any())
         self._kind, self._table = mi.Float(kind), mi.Float(tables.ravel())
-        self.table, self.transmissive = tables, mi.Float(transmissive)
+        self.table = tables
 
     def _separated(self, bsdf):
         """The table of a when the BSDF keeps its diffuse lobe apart and that lobe separates; else None."""
@@ -67,9 +65,9 @@ class BroadLobes:
         z = np.linspace(0, 1, N_TABLE)
         z[0] = 1e-3
 
-        def value(context, wi, wo):
+        def value(context, wi, wo, uv=(0.37, 0.61)):
             si = dr.zeros(mi.SurfaceInteraction3f, len(wi))
-            si.wi, si.uv = mi.Vector3f(wi.T.astype(np.float32)), mi.Point2f(0.37, 0.61)
+            si.wi, si.uv = mi.Vector3f(wi.T.astype(np.float32)), mi.Point2f(np.asarray(uv, np.float32))
             si.n = mi.Normal3f(0, 0, 1)
             si.sh_frame = mi.Frame3f(si.n)
             return np.array(bsdf.eval(context, si, mi.Vector3f(wo.T.astype(np.float32)))).T
@@ -88,8 +86,10 @@ class BroadLobes:
             return None
         table = along.sum(1) / along[-1].sum()
         model = np.interp(wi[:, 2], z, table) * np.interp(wo[:, 2], z, table) * wo[:, 2]
-        model = model[:, None] * along[-1]
-        measured = value(self.diffuse, wi, wo)
+        # Elsewhere on a texture the lobe may be of another colour, not of another shape.
+        uv, up = rng.random((2, len(wi))), np.tile([0.0, 0.0, 1.0], (len(wi), 1))
+        model = model[:, None] * value(self.diffuse, up, up, uv)
+        measured = value(self.diffuse, wi, wo, uv)
         return None if np.abs(model - measured).max() > SEPARABLE * measured.max() else table
 
     def albedo(self, bsdf, index, si, active=True):
@@ -132,14 +132,6 @@ class BroadLobes:
         a = dr.gather(mi.Float, self._table, at, active)
         b = dr.gather(mi.Float, self._table, at + 1, active)
         return dr.select(cosine > 0, dr.lerp(a, b, t), 0)
-
-    def shape_numpy(self, index, cosine):
-        """`shape` for arrays of NumPy."""
-        x = np.clip(cosine, 0, 1) * (N_TABLE - 1)
-        low = np.minimum(x.astype(np.int64), N_TABLE - 2)
-        t = x - low
-        value = self.table[index, low] * (1 - t) + self.table[index, low + 1] * t
-        return np.where(cosine > 0, value, 0)
 
     def value(self, index, albedo, wi, wo):
         """Broad lobe times cosine of ``wo``."""

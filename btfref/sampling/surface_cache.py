@@ -120,7 +120,7 @@ class VisibilityCache:
             direction = dr.gather(mi.UInt32, self._members, i)
             w = dr.gather(mi.Vector3f, self.vectors, direction)
             active = mi.Bool(True) if side is None else side * dr.dot(si.sh_frame.n, w) > 0
-            free = active & ~tiles.occluded(si.spawn_ray(w), active)
+            free = active & ~tiles.occluded(si.spawn_ray(w), active, coherent=False)
             at = dr.fma(lane, n, direction)
             if self.bits is None:
                 cached = mi.UInt32(0)

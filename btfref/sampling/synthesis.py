@@ -65,7 +65,8 @@ def synthesize(
         Called as ``progress(done, total, label)`` after each view.
     estimator : str
         "path", the reference, or "surface", which traces visibility once for all views and lights; see
-        `btfref.sampling.surface_estimator`. `spp` then counts surface points per texel of the tile.
+        `btfref.sampling.surface_estimator`. `spp` then counts surface points per texel of the tile. Where a
+        material transmits, masks or mirrors, "path" takes its place and the attribute ``fallback`` says so.
     overwrite : bool
         Replace a store of other settings.
     variant : str

@@ -114,13 +114,15 @@ class TiledScene:
         interaction.p = mi.Point3f(p.x - dr.floor(p.x), p.y - dr.floor(p.y), p.z)
         return interaction, hit
 
-    def occluded(self, ray, active):
+    def occluded(self, ray, active, *, coherent=True):
         """Whether the infinitely tiled surface blocks rays that start in the central tile.
 
         Parameters
         ----------
         ray : mitsuba.Ray3f
         active : mitsuba.Bool
+        coherent : bool
+            Whether neighbouring rays are alike.
 
         Returns
         -------
@@ -130,13 +132,13 @@ class TiledScene:
         import mitsuba as mi
 
         if not self.wrap_shadows:
-            return self.scene.ray_test(ray, coherent=True, active=active)
+            return self.scene.ray_test(ray, coherent=coherent, active=active)
         travel, direction = self._travel(ray.d), mi.Vector3f(ray.d)
 
         def search(origin, blocked, searching, rounds):
             part = mi.Ray3f(origin, direction)
             part.maxt = travel
-            blocked = blocked | self.scene.ray_test(part, coherent=True, active=searching)
+            blocked = blocked | self.scene.ray_test(part, coherent=coherent, active=searching)
             end, inside = self._wrapped(origin, direction, travel)
             searching = searching & ~blocked & inside & (rounds < MAXIMUM_ROUNDS)
             return dr.select(searching, end, origin), blocked, searching, rounds + 1

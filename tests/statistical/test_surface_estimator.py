@@ -139,3 +139,21 @@ def test_tiles_are_filled_alone(tmp_path, estimator):
     assert np.array_equal(part.values, whole.values[:, :, :64, 64:])
     assert np.array_equal(part.variance, whole.variance[:, :, :64, 64:])
     assert open_store(out).coverage.mean() == 0.5
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "word"),
+    [
+        ({"type": "dielectric"}, "transmission"),
+        ({"type": "roughdielectric", "alpha": 0.3}, "transmission"),
+        ({"type": "conductor"}, "mirror"),
+        ({"type": "mask", "opacity": 0.5, "nested": {"type": "diffuse"}}, "mask"),
+    ],
+)
+def test_paths_take_over_where_points_cannot(bsdf, word):
+    settings = SMALL | {"texels": 2, "bsdf": bsdf}
+    made = synthesize("flat", **settings)
+    assert made.attributes["estimator"] == "path"
+    assert word in made.attributes["fallback"]
+    assert np.array_equal(made.values, synthesize("flat", **settings | {"estimator": "path"}).values)
+    assert "fallback" not in synthesize("flat", **SMALL | {"texels": 2}).attributes

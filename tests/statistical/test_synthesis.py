@@ -72,19 +72,20 @@ def test_flat_material_equals_its_eval(llvm, bsdf):
     assert value.max() > 0
 
 
-def test_white_furnace():
+@pytest.mark.parametrize(("estimator", "spp"), [("path", 2048), ("surface", 256)])
+def test_white_furnace(estimator, spp):
     """All-white walls at full depth return all light, whatever the view: the hemispherical albedo is 1."""
     tile = _faceted(_diffuse(build("checker", resolution=32), 1.0))
     lights, weights = gauss_hemisphere(8, 16)
     views = directions("ubo81").vectors[[0, 70]]
-    settings = {"texels": 2, "views": views, "lights": lights, "dtype": "float32"}
+    settings = {"texels": 2, "views": views, "lights": lights, "dtype": "float32", "estimator": estimator}
 
     def albedo(spp, max_depth):
         values = synthesize(tile, spp=spp, max_depth=max_depth, seed=3, **settings).values.astype(np.float64)
         return np.einsum("l,vlrcx->vrcx", weights, values).mean((1, 2, 3))
 
     limit = tolerance("synthesis.furnace")
-    assert np.abs(albedo(2048, -1) - 1).max() <= limit
+    assert np.abs(albedo(spp, -1) - 1).max() <= limit
     # Direct light alone loses what falls on other walls.
     assert (1 - albedo(256, 2) > 5 * limit).all()
 

@@ -1,0 +1,32 @@
+"""Where the shared estimator does not apply, the path estimator takes its place."""
+
+from __future__ import annotations
+
+
+def reason_against_surface(bsdfs):
+    """Why the estimator ``surface`` cannot be used; None where it can.
+
+    Its points scatter light on the side it came from, with BSDFs that can be evaluated: light that passes
+    through a surface, mirrors and masks are left to paths.
+
+    Parameters
+    ----------
+    bsdfs : list of mitsuba.BSDF
+        One per part; the variant they were loaded in is active.
+
+    Returns
+    -------
+    str or None
+    """
+    import mitsuba as mi
+
+    kinds = {
+        "a mask": mi.BSDFFlags.Null,
+        "transmission": mi.BSDFFlags.Transmission,
+        "a mirror": mi.BSDFFlags.Delta,
+    }
+    for index, bsdf in enumerate(bsdfs):
+        for name, flag in kinds.items():
+            if mi.has_flag(bsdf.flags(), flag):
+                return f"part {index} has {name}"
+    return None
