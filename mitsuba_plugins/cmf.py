@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from btfref.representations.factored import FACTORS, index_slots
 from mitsuba_plugins.lookup import read_packets, texel_stencil, wide
-from mitsuba_plugins.parabolic import ParabolicMaps, bilinear_stencil, half_difference
+from mitsuba_plugins.parabolic import ParabolicMaps, bilinear_stencil, half_difference, unpacked
 
 
 class Evaluator:
@@ -23,7 +23,9 @@ class Evaluator:
         """Take over changed maps."""
         tensors = maps.tensors
         self.factors = {
-            name: ParabolicMaps(tensors[f"factor_{name}"]) for name in FACTORS if f"factor_{name}" in tensors
+            name: ParabolicMaps(tensors[f"factor_{name}"], self.constants["map_power"])
+            for name in FACTORS
+            if f"factor_{name}" in tensors
         }
         self.index, self.index_stride = mi.UInt32(tensors["index"].array), tensors["index"].shape[-1]
         self.scale = self._readable(tensors["scale_map"])
@@ -36,12 +38,14 @@ class Evaluator:
         return mi.UInt32(tensor.array) if dr.is_integral_v(tensor.array) else wide(tensor)
 
     @staticmethod
-    def _colour(values, at, active):
+    def _colour(values, at, power, active):
         """Colour ``at`` of a map of scales."""
         if dr.is_integral_v(values):
-            word = dr.gather(mi.UInt32, values, at, active)
-            return mi.Color3f(*(mi.Float((word >> shift) & 255) for shift in (0, 8, 16))) * (1 / 255)
-        return mi.Color3f(*(mi.Float(c) for c in read_packets(values, at, 4, active)[:3]))
+            colour, factor = unpacked(dr.gather(mi.UInt32, values, at, active))
+            colour = mi.Color3f(*colour) * factor
+        else:
+            colour = mi.Color3f(*(mi.Float(c) for c in read_packets(values, at, 4, active)[:3]))
+        return colour * colour if power == 2 else colour
 
     def _value(self, texel, stencils, active):
         """B of one texel but for the fall to the horizon."""
@@ -55,7 +59,9 @@ class Evaluator:
         in_out = mi.Color3f(0)
         for k in range(n_terms):
             peak = dr.gather(mi.Vector4f, self.peak, mi.UInt32(k))
-            scale = self._colour(self.scale, texel * n_terms + k, active) * mi.Color3f(peak.x, peak.y, peak.z)
+            scale = self._colour(
+                self.scale, texel * n_terms + k, self.constants["scale_power"], active
+            ) * mi.Color3f(peak.x, peak.y, peak.z)
             in_out += scale * read("p", k) * read("r", k)
         half = mi.Color3f(0)
         for j in range(n_half_terms):
@@ -63,7 +69,9 @@ class Evaluator:
             if "d" in self.factors:
                 term *= read("d", j)
             if self.half_scale is not None:
-                term *= self._colour(self.half_scale, texel * n_half_terms + j, active)
+                term *= self._colour(
+                    self.half_scale, texel * n_half_terms + j, self.constants["map_power"], active
+                )
             half += term
         return in_out * half
 

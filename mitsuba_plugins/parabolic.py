@@ -39,6 +39,11 @@ def bilinear_stencil(w, n):
     )
 
 
+def unpacked(word):
+    """Three channels of a word of 8-bit codes, and the factor that makes numbers in [0, 1] of them."""
+    return [mi.Float((word >> shift) & 255) for shift in (0, 8, 16)], 1 / 255
+
+
 class ParabolicMaps:
     """A stack of parabolic maps of RGB values.
 
@@ -48,10 +53,12 @@ class ParabolicMaps:
     Parameters
     ----------
     values : TensorXf, TensorXf16, shape (slices, n, n, 4), or TensorXu of packed codes, shape (slices, n, n, 1)
+    power : int
+        1 or 2: what the numbers in the maps are raised to.
     """
 
-    def __init__(self, values):
-        self.n = values.shape[1]
+    def __init__(self, values, power):
+        self.n, self.power = values.shape[1], power
         self.texels = self.n * self.n
         self.kind, self.values = dr.type_v(values.array), values.array
         if self.kind == dr.VarType.UInt32:
@@ -80,14 +87,15 @@ class ParabolicMaps:
         total = [mi.Float(0)] * 3
         for index, weight in zip(*stencil, strict=True):
             colour, factor = self._texel(first + index, active)
+            if self.power == 2:
+                colour, factor = [c * c for c in colour], factor * factor
             total = [dr.fma(c, weight, t) for c, t in zip(colour, total, strict=True)]
         return mi.Color3f(*total) * factor
 
     def _texel(self, texel, active):
         """Three channels, and the factor that makes values of them."""
         if self.kind == dr.VarType.UInt32:
-            word = dr.gather(mi.UInt32, self.values, texel, active)
-            return [mi.Float((word >> shift) & 255) for shift in (0, 8, 16)], 1 / 255
+            return unpacked(dr.gather(mi.UInt32, self.values, texel, active))
         if self.kind == "words":
             low, high = read_packets(self.values, texel, 2, active)
             (r, g), (b, _) = widened(low), widened(high)

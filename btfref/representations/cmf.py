@@ -8,9 +8,10 @@ measured parameterization; the leading terms of that residue are the factors of 
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
-from btfref.errors import InputError
 from btfref.numerics.directions import DirectionSet, ring_directions
 from btfref.numerics.factoring import (
     TINY,
@@ -23,19 +24,29 @@ from btfref.numerics.factoring import (
 from btfref.numerics.halfway import half_difference, in_out
 from btfref.numerics.parabolic import texel_directions
 from btfref.representations.factored import Representation, light_fade, texel_parts
-from btfref.representations.factored_fit import assemble, check_parameters, map_operators, unit_tables
+from btfref.representations.factored_fit import (
+    Factors,
+    Steps,
+    checked_map_size,
+    checked_ranges,
+    factorized,
+    map_operators,
+)
+from btfref.representations.factored_storage import Storing, cluster, store
 from btfref.representations.lookup import positive_integer
 
 __all__ = ["PRESETS", "Representation", "fit"]
 
 #: "paper": factors as the chain leaves them, all in 8 bits, scales from the normalisation alone.
-PRESETS = {"paper": {"sweeps": 0, "rescale": False, "storage": "byte", "scale_storage": "byte"}}
+PRESETS = {
+    "paper": {"sweeps": 0, "rescale": False, "storage": "byte", "scale_storage": "byte", "code": "linear"}
+}
 
 #: Step of the difference directions in degrees: the paper's 8 polar angles.
 DIFFERENCE_STEP = 11.25
 
-#: Texels on which the resampling errors are measured.
-N_PROBED = 48
+#: Parts of the texels on which the resampling errors are measured.
+N_PROBED_PARTS = 3
 
 
 def ring_set(step):
@@ -189,6 +200,7 @@ def fit(
     clusters=256,
     storage="half",
     scale_storage=None,
+    code="square",
     rescale=True,
     filter_type="bilinear",
 ):
@@ -202,6 +214,58 @@ def fit(
         Of the clustering.
     progress : callable, optional
         ``progress(done, total, label)``.
+    difference, terms, sweeps, exponent, floor, half_step, map_size
+        Of the factorization: see :func:`factorize`.
+    clusters, storage, scale_storage, code, rescale, filter_type
+        See :class:`btfref.representations.factored_storage.Storing`.
+
+    Returns
+    -------
+    Representation
+        ``meta["fit"]``: relative squared errors of the factors ("factors"), of the maps before clustering ("maps"),
+        and of what is stored ("error"); "resampling": relative RMS errors of the changes of parameterization.
+
+    Raises
+    ------
+    InputError
+        For parameters out of range, or a value that is not finite.
+    """
+    storing = Storing(clusters, storage, scale_storage, code, rescale, filter_type)
+    step = Steps(progress, len(texel_parts(int(np.prod(btf.texels)))) + 4 + bool(difference))
+    factors = factorize(
+        btf,
+        step=step,
+        difference=difference,
+        terms=terms,
+        sweeps=sweeps,
+        exponent=exponent,
+        floor=floor,
+        half_step=half_step,
+        map_size=map_size,
+    )
+    codebooks = cluster(factors, clusters, seed=seed, step=step)
+    return store(btf, codebooks, storing, seed=seed, step=step)
+
+
+def factorize(
+    btf,
+    *,
+    step=lambda label: None,
+    difference=False,
+    terms=1,
+    sweeps=8,
+    exponent=0.75,
+    floor=1e-3,
+    half_step=5.0,
+    map_size=32,
+):
+    """Factors of every texel of ``btf``, not yet clustered.
+
+    Parameters
+    ----------
+    btf : SampledBTF
+    step : callable
+        ``step(label)``, called now and then.
     difference : bool
         Four factors: with one of the difference vector.
     terms : int
@@ -219,69 +283,41 @@ def fit(
         Degrees between samples of the half vector.
     map_size : int
         Texels along a side of a parabolic map, at least 2.
-    clusters : int or None
-        Largest codebook of each factor; None: no clustering.
-    storage : {"half", "float", "byte"}
-    scale_storage : {"half", "float", "byte"}, optional
-        Of the scale map. None: that of the maps, but half for "byte". Differs from the paper, whose scale map has 8
-        bits too: scales of texels with and without highlights differ by more than 255.
-    rescale : bool
-        Fit the scales to the data again with the stored maps.
-    filter_type : {"bilinear", "nearest"}
 
     Returns
     -------
-    Representation
-        ``meta["fit"]``: relative squared errors of the factors ("factors"), of the maps before clustering ("maps"),
-        and of what is stored ("error"); "resampling": relative RMS errors of the changes of parameterization.
-
-    Raises
-    ------
-    InputError
-        For parameters out of range, or a value that is not finite.
+    btfref.representations.factored_fit.Factors
     """
-    check_parameters(clusters=clusters, storage=storage, scale_storage=scale_storage)
-    terms, map_size = positive_integer("terms", terms), positive_integer("map_size", map_size)
-    if map_size < 2:
-        raise InputError("a parameter is out of range", field="map_size", got=map_size, expected="at least 2")
-    for name, value, low, high in (
-        ("floor", floor, 0, 1),
-        ("half_step", half_step, 0.5, 90),
-        ("sweeps", sweeps, 0, 1000),
-        ("exponent", exponent, 0, 2),
-    ):
-        if not low <= value <= high:
-            raise InputError(
-                "a parameter is out of range", field=name, got=value, expected=f"{low} to {high}"
-            )
-    rows, columns = btf.values.shape[2:4]
-    n_texels = rows * columns
-    parts = texel_parts(n_texels)
-    # Then come the codebooks and the scales.
-    steps = len(parts) + 4 + difference
-    report = progress or (lambda *_: None)
+    terms, map_size = positive_integer("terms", terms), checked_map_size(map_size)
+    checked_ranges(
+        floor=(floor, 0, 1),
+        half_step=(half_step, 0.5, 90),
+        sweeps=(sweeps, 0, 1000),
+        exponent=(exponent, 0, 2),
+    )
+    step("resampling")
     resampling = Resampling(btf.views, btf.lights, half_step, map_size, difference)
-    names = tuple(resampling.to_maps)
     # The mean over difference directions is one term, whatever the number of P and R.
-    counts = {name: terms if difference or name != "q" else 1 for name in names}
-    maps = {name: np.zeros((n_texels, counts[name], map_size, map_size, 3), np.float32) for name in names}
-    energy, squared = 0.0, dict.fromkeys(("factors", "maps"), 0.0)
-    probes = []
-    for step, texels in enumerate(parts):
-        report(step + 1, steps, "factorization")
-        data, mean = unit_tables(btf, texels)
+    counts = {name: terms if difference or name != "q" else 1 for name in resampling.to_maps}
+    n_parts = len(texel_parts(int(np.prod(btf.texels))))
+    # A few parts from all over the texture.
+    probed = set(np.linspace(0, n_parts - 1, min(N_PROBED_PARTS, n_parts)).round().astype(int).tolist())
+    probes, done = [], itertools.count()
+
+    def one_part(data):
         factors = chain(data, resampling, terms, floor)
-        energy += float(((data * mean).astype(float) ** 2).sum())
-        squared["factors"] += _squared_error(data, resampling.measured.product(factors), mean)
-        if step % max(1, len(parts) // 4) == 0 and len(probes) * len(texels) < N_PROBED:
+        models = {"factors": resampling.measured.product(factors)}
+        if next(done) in probed:
             probes.append(resampling.errors(data, factors))
         factors = refine(data, factors, resampling.through_maps, sweeps, sample_weights(data, exponent))
-        squared["maps"] += _squared_error(data, resampling.through_maps.product(factors), mean)
-        factors["p"] = factors["p"] * mean
-        for name in names:
-            values = np.stack([resampling.to_maps[name] @ term for term in factors[name]])
-            values = values.reshape(counts[name], map_size, map_size, len(texels), 3)
-            maps[name][texels] = np.moveaxis(values, 3, 0)
+        models["maps"] = resampling.through_maps.product(factors)
+        maps = {
+            name: np.stack([resampling.to_maps[name] @ term for term in factors[name]]) for name in factors
+        }
+        return maps, models
+
+    maps, facts = factorized(btf, counts, map_size, step, one_part)
+    facts["resampling"] = {name: float(np.mean([p[name] for p in probes])) for name in probes[0]}
     parameters = {
         "difference": difference,
         "terms": terms,
@@ -290,26 +326,5 @@ def fit(
         "floor": floor,
         "half_step": half_step,
         "map_size": map_size,
-        "clusters": clusters,
-        "storage": storage,
-        "scale_storage": scale_storage,
-        "rescale": rescale,
-        "seed": seed,
     }
-    labels = iter(range(len(parts) + 1, steps + 1))
-    result = assemble(
-        "cmf",
-        btf,
-        maps,
-        parameters,
-        exponent=exponent,
-        filter_type=filter_type,
-        report=lambda label: report(next(labels), steps, label),
-    )
-    result.meta["fit"] |= {name: value / energy if energy > 0 else 0.0 for name, value in squared.items()}
-    result.meta["fit"]["resampling"] = {name: float(np.mean([p[name] for p in probes])) for name in probes[0]}
-    return result
-
-
-def _squared_error(data, model, mean):
-    return float((((model - data) * mean).astype(float) ** 2).sum())
+    return Factors("cmf", maps, exponent, parameters, facts)

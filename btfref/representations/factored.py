@@ -31,7 +31,8 @@ class Representation(StoredMaps):
     ``factor_p``, ``factor_q``, ``factor_r`` and, in the four-factor form, ``factor_d`` [prototype, n, n, 3];
     ``index`` [row, column, channel] uint32: a prototype for each term of P, then of Q, R and D; ``scale_map``
     [row, column, term, 3] in [0, 1] times ``scale_peak`` [term, 3]; ``half_scale`` [row, column, term, 3] with more
-    than one term of Q · D. uint8 maps hold 255 times their value.
+    than one term of Q · D. uint8 maps hold 255 times their numbers. The constants ``map_power`` and ``scale_power``
+    are 1 or 2: what the numbers in the maps, and in the map of scales, are raised to.
     """
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
@@ -44,7 +45,7 @@ class Representation(StoredMaps):
         index = self.maps["index"].reshape(-1, self.maps["index"].shape[-1])
         scale, half_scale = self._scales()
         tables = {name: self.maps[f"factor_{name}"].reshape(-1, n * n, 3) for name in self.names}
-        slots = index_slots(meta["constants"])
+        slots, power = index_slots(meta["constants"]), meta["constants"]["map_power"]
 
         def lookup(uv, w_light, w_view):
             texel, weight = conventions.texel_stencil(uv, meta["texels"], meta["filter_type"])
@@ -58,7 +59,7 @@ class Representation(StoredMaps):
             def read(name, k):
                 texels, share = stencils[name]
                 prototype = index[texel, slots[name].start + k]
-                values = decoded(tables[name][prototype[:, :, None], texels[:, None, :]])
+                values = decoded(tables[name][prototype[:, :, None], texels[:, None, :]], power)
                 return np.einsum("nxtc,nt->nxc", values, share)
 
             in_out = sum(
@@ -80,10 +81,13 @@ class Representation(StoredMaps):
 
     def _scales(self):
         """Scales of the terms of P · R and of Q · D, shapes (texel, term, 3), in float64."""
-        scale = decoded(self.maps["scale_map"]) * self.maps["scale_peak"].astype(float)
+        constants = self.meta["constants"]
+        scale = decoded(self.maps["scale_map"], constants["scale_power"]) * self.maps["scale_peak"].astype(
+            float
+        )
         scale = scale.reshape(-1, *scale.shape[2:])
         if "half_scale" in self.maps:
-            half = decoded(self.maps["half_scale"])
+            half = decoded(self.maps["half_scale"], constants["map_power"])
             return scale, half.reshape(-1, *half.shape[2:])
         return scale, np.ones((len(scale), 1, 3))
 
@@ -100,12 +104,12 @@ class Representation(StoredMaps):
         dict of str to ndarray of float32, shape (term, n², k * 3)
         """
         index = self.maps["index"].reshape(-1, self.maps["index"].shape[-1])[texels]
-        slots = index_slots(self.meta["constants"])
+        slots, power = index_slots(self.meta["constants"]), self.meta["constants"]["map_power"]
         scale, half_scale = self._scales()
         result = {}
         for name in self.names:
             table = self.maps[f"factor_{name}"]
-            maps = decoded(table[index[:, slots[name]]], np.float32)  # texel, term, n, n, 3
+            maps = decoded(table[index[:, slots[name]]], power, np.float32)  # texel, term, n, n, 3
             for amount, of in ((scale, "p"), (half_scale, "q")):
                 if name == of:
                     maps = maps * amount[texels][:, :, None, None].astype(np.float32)
@@ -167,11 +171,12 @@ def light_fade(w_light, cos_last):
     return np.minimum(np.asarray(w_light, float)[..., 2] / cos_last, 1)
 
 
-def decoded(array, dtype=float):
-    """Values of a stored map: uint8 codes are divided by 255."""
+def decoded(array, power, dtype=float):
+    """Values of a stored map: what is stored (of uint8 a 255th) to the ``power`` of 1 or 2."""
+    values = array.astype(dtype)
     if array.dtype == np.uint8:
-        return array.astype(dtype) / dtype(255)
-    return array.astype(dtype)
+        values /= dtype(255)
+    return values * values if power == 2 else values
 
 
 def batch_last(maps):

@@ -11,16 +11,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.errors import InputError
 from btfref.numerics.parabolic import texel_centres
 from btfref.representations.factored import Representation, texel_parts
-from btfref.representations.factored_fit import assemble, check_parameters, map_operators, unit_tables
-from btfref.representations.lookup import positive_integer
+from btfref.representations.factored_fit import (
+    Factors,
+    Steps,
+    checked_map_size,
+    checked_ranges,
+    factorized,
+    map_operators,
+    unit_tables,
+)
+from btfref.representations.factored_storage import Storing, cluster, store
 
 __all__ = ["PRESETS", "Representation", "fit"]
 
 #: "paper": all in 8 bits, scales from the normalisation alone.
-PRESETS = {"paper": {"rescale": False, "storage": "byte", "scale_storage": "byte"}}
+PRESETS = {"paper": {"rescale": False, "storage": "byte", "scale_storage": "byte", "code": "linear"}}
 
 #: Candidates for λ where none is given.
 SMOOTHNESS = (0.3, 1.0, 3.0, 10.0)
@@ -134,6 +141,7 @@ def fit(
     clusters=256,
     storage="half",
     scale_storage=None,
+    code="square",
     rescale=True,
     filter_type="bilinear",
 ):
@@ -147,22 +155,10 @@ def fit(
         Of the held-out samples and of the clustering.
     progress : callable, optional
         ``progress(done, total, label)``.
-    smoothness : float, optional
-        λ of the smoothing rows. None: of ``SMOOTHNESS`` the one that predicts the logarithms of a fifth of the samples
-        of some texels best from the others.
-    floor : float
-        Share of its mean below which a texel's value counts as that much: logarithms need positive numbers, and
-        without a floor the least values would rule the fit. A black texel stays black.
-    map_size : int
-        Texels along a side of a parabolic map, at least 2.
-    clusters : int or None
-        Largest codebook of each factor; None: no clustering.
-    storage : {"half", "float", "byte"}
-    scale_storage : {"half", "float", "byte"}, optional
-        Of the scale map. None: that of the maps, but half for "byte".
-    rescale : bool
-        Fit the scales to the data by weighted least squares with the stored maps, as :func:`cmf.fit` does.
-    filter_type : {"bilinear", "nearest"}
+    smoothness, floor, map_size
+        Of the factorization: see :func:`factorize`.
+    clusters, storage, scale_storage, code, rescale, filter_type
+        See :class:`btfref.representations.factored_storage.Storing`.
 
     Returns
     -------
@@ -175,73 +171,67 @@ def fit(
     InputError
         For parameters out of range, or a value that is not finite.
     """
-    check_parameters(clusters=clusters, storage=storage, scale_storage=scale_storage)
-    map_size = positive_integer("map_size", map_size)
-    if map_size < 2:
-        raise InputError("a parameter is out of range", field="map_size", got=map_size, expected="at least 2")
-    if not 0 < floor <= 1:
-        raise InputError(
-            "a parameter is out of range", field="floor", got=floor, expected="above 0, at most 1"
-        )
-    if smoothness is not None and not 0 < smoothness < np.inf:
-        raise InputError(
-            "a parameter is out of range", field="smoothness", got=smoothness, expected="a number above 0"
-        )
-    report = progress or (lambda *_: None)
-    n_texels = int(np.prod(btf.values.shape[2:4]))
-    parts = texel_parts(n_texels)
-    steps = len(parts) + 6
-    report(1, steps, "smoothness")
-    system = LogSystem(btf.views, btf.lights, map_size)
-    meta = {}
+    storing = Storing(clusters, storage, scale_storage, code, rescale, filter_type)
+    step = Steps(progress, len(texel_parts(int(np.prod(btf.texels)))) + 5)
+    factors = factorize(btf, seed=seed, step=step, smoothness=smoothness, floor=floor, map_size=map_size)
+    codebooks = cluster(factors, clusters, seed=seed, step=step)
+    return store(btf, codebooks, storing, seed=seed, step=step)
+
+
+def factorize(btf, *, seed=0, step=lambda label: None, smoothness=None, floor=1e-3, map_size=32):
+    """Factors of every texel of ``btf``, not yet clustered.
+
+    Parameters
+    ----------
+    btf : SampledBTF
+    seed : int
+        Of the held-out samples.
+    step : callable
+        ``step(label)``, called now and then.
+    smoothness : float, optional
+        λ of the smoothing rows. None: of ``SMOOTHNESS`` the one that predicts the logarithms of a fifth of the samples
+        of some texels best from the others.
+    floor : float
+        Share of its mean below which a texel's value counts as that much: logarithms need positive numbers, and
+        without a floor the least values would rule the fit. A black texel stays black.
+    map_size : int
+        Texels along a side of a parabolic map, at least 2.
+
+    Returns
+    -------
+    btfref.representations.factored_fit.Factors
+    """
+    map_size = checked_map_size(map_size)
+    # Above 0: the least positive floats are in range.
+    checked_ranges(floor=(floor, np.finfo(float).tiny, 1))
+    if smoothness is not None:
+        checked_ranges(smoothness=(smoothness, np.finfo(float).tiny, np.finfo(float).max))
+    step("smoothness")
+    system, facts = LogSystem(btf.views, btf.lights, map_size), {}
     if smoothness is None:
+        n_texels = int(np.prod(btf.texels))
         some = np.unique(np.linspace(0, n_texels - 1, min(N_JUDGED, n_texels)).round().astype(int))
         data, _ = unit_tables(btf, some)
         chosen, errors = system.choose_smoothness(logarithms(data, floor), np.random.default_rng(seed))
-        meta["held_out"] = dict(zip(map(str, SMOOTHNESS), errors, strict=True))
+        facts["held_out"] = dict(zip(map(str, SMOOTHNESS), errors, strict=True))
     else:
         chosen = float(smoothness)
-    report(2, steps, "factorization")
+    step("factorization")
     factor = system.factorize(chosen)
     operators = map_operators(btf.views.vectors, btf.lights.vectors, map_size, False)
-    maps = {name: np.zeros((n_texels, 1, map_size, map_size, 3), np.float32) for name in "pqr"}
-    energy = squared = log_squared = 0.0
-    for step, texels in enumerate(parts):
-        report(step + 2, steps, "factorization")
-        data, mean = unit_tables(btf, texels)
+    log_errors = []
+
+    def one_part(data):
         log_data = logarithms(data, floor)
         solution = system.solve(factor, log_data)
-        log_squared += float(((system.rows @ solution - log_data) ** 2).sum())
-        found = system.maps(solution)
-        found["p"] = found["p"] * mean
-        model = operators.product({name: values[None] for name, values in found.items()})
-        energy += float(((data * mean).astype(float) ** 2).sum())
-        squared += float(((model - data * mean).astype(float) ** 2).sum())
-        for name, values in found.items():
-            maps[name][texels, 0] = np.moveaxis(values.reshape(map_size, map_size, len(texels), 3), 2, 0)
-    parameters = {
-        "smoothness": smoothness,
-        "floor": floor,
-        "map_size": map_size,
-        "clusters": clusters,
-        "storage": storage,
-        "scale_storage": scale_storage,
-        "rescale": rescale,
-        "seed": seed,
-    }
-    labels = iter(range(len(parts) + 3, steps + 1))
-    result = assemble(
-        "hf",
-        btf,
-        maps,
-        parameters,
-        exponent=EXPONENT,
-        filter_type=filter_type,
-        report=lambda label: report(next(labels), steps, label),
-    )
-    result.meta["fit"] |= meta | {
-        "maps": squared / energy if energy > 0 else 0.0,
+        log_errors.append(((system.rows @ solution - log_data) ** 2).mean(0))
+        maps = {name: values[None] for name, values in system.maps(solution).items()}
+        return maps, {"maps": operators.product(maps)}
+
+    maps, errors = factorized(btf, dict.fromkeys("pqr", 1), map_size, step, one_part)
+    facts |= errors | {
         "smoothness": chosen,
-        "log_rms": float(np.sqrt(log_squared / (n_texels * 3 * len(system.rows.indptr[1:])))),
+        "log_rms": float(np.sqrt(np.concatenate(log_errors).mean())),
     }
-    return result
+    parameters = {"smoothness": smoothness, "floor": floor, "map_size": map_size}
+    return Factors("hf", maps, EXPONENT, parameters, facts)

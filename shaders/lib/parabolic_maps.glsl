@@ -1,4 +1,4 @@
-// Provides parabolic_stencil and parabolic_lookup: bilinear lookups in stacks of parabolic maps of the hemisphere.
+// Provides raised, parabolic_stencil and parabolic_lookup: bilinear lookups in stacks of parabolic maps of the hemisphere.
 // Expects a table [slice, row, column, channels <= 4]; conventions are those of btfref/numerics/parabolic.py.
 
 #include "lib/stencil.glsl"
@@ -22,11 +22,16 @@ Stencil parabolic_stencil(vec3 w, int n) {
         vec4((1.0 - f.x) * (1.0 - f.y), f.x * (1.0 - f.y), (1.0 - f.x) * f.y, f.x * f.y));
 }
 
+// What a stored number stands for; the power is 1 or 2. The square spreads 8-bit codes over the dark values.
+vec3 raised(vec4 stored, int power) {
+    return power == 2 ? stored.rgb * stored.rgb : stored.rgb;
+}
+
 // The slice is a whole number and its texels are fetched one by one, so that no neighbouring slice leaks in.
-vec3 parabolic_lookup(sampler2DArray maps, int slice, int n, Stencil s) {
+vec3 parabolic_lookup(sampler2DArray maps, int slice, int n, Stencil s, int power) {
     int first = slice * n * n;
-    vec3 sum = s.weight.x * table_fetch(maps, first + s.index.x).rgb;
-    sum += s.weight.y * table_fetch(maps, first + s.index.y).rgb;
-    sum += s.weight.z * table_fetch(maps, first + s.index.z).rgb;
-    return sum + s.weight.w * table_fetch(maps, first + s.index.w).rgb;
+    vec3 sum = s.weight.x * raised(table_fetch(maps, first + s.index.x), power);
+    sum += s.weight.y * raised(table_fetch(maps, first + s.index.y), power);
+    sum += s.weight.z * raised(table_fetch(maps, first + s.index.z), power);
+    return sum + s.weight.w * raised(table_fetch(maps, first + s.index.w), power);
 }

@@ -47,21 +47,22 @@ vec3 btf_eval(vec2 uv, vec3 w_light, vec3 w_view, float lod) {
         int texel = texels.index[x];
         vec3 in_out = vec3(0.0);
         for (int k = 0; k < N_TERMS; ++k) {
-            vec3 amount = table_fetch(scale_map, texel * N_TERMS + k).rgb * table_fetch(scale_peak, k).rgb;
-            vec3 p = parabolic_lookup(factor_p, prototype(texel, k), FACTOR_P_DIM1, at_light);
+            vec3 amount = raised(table_fetch(scale_map, texel * N_TERMS + k), SCALE_POWER);
+            amount *= table_fetch(scale_peak, k).rgb;
+            vec3 p = parabolic_lookup(factor_p, prototype(texel, k), FACTOR_P_DIM1, at_light, MAP_POWER);
             vec3 r = parabolic_lookup(
-                factor_r, prototype(texel, N_TERMS + N_HALF_TERMS + k), FACTOR_R_DIM1, at_view);
+                factor_r, prototype(texel, N_TERMS + N_HALF_TERMS + k), FACTOR_R_DIM1, at_view, MAP_POWER);
             in_out += amount * p * r;
         }
         vec3 half_sum = vec3(0.0);
         for (int j = 0; j < N_HALF_TERMS; ++j) {
-            vec3 q = parabolic_lookup(factor_q, prototype(texel, N_TERMS + j), FACTOR_Q_DIM1, at_half);
+            vec3 q = parabolic_lookup(factor_q, prototype(texel, N_TERMS + j), FACTOR_Q_DIM1, at_half, MAP_POWER);
 #ifdef FACTOR_D_DIM0
             q *= parabolic_lookup(
-                factor_d, prototype(texel, 2 * N_TERMS + N_HALF_TERMS + j), FACTOR_D_DIM1, at_difference);
+                factor_d, prototype(texel, 2 * N_TERMS + N_HALF_TERMS + j), FACTOR_D_DIM1, at_difference, MAP_POWER);
 #endif
 #ifdef HALF_SCALE_DIM0
-            q *= table_fetch(half_scale, texel * N_HALF_TERMS + j).rgb;
+            q *= raised(table_fetch(half_scale, texel * N_HALF_TERMS + j), MAP_POWER);
 #endif
             half_sum += q;
         }
