@@ -1,4 +1,4 @@
-"""Factored BTFs: speed of the factorizations and of clustering, and what 8-bit maps cost.
+"""Factored BTFs: speed of the factorizations and of clustering, and what 8-bit maps and codebooks cost.
 
 Suykens et al. 2003 report, for one texel of 4096 samples and one channel, 33 s with homomorphic factorization and 8 s
 with chained matrix factorization, 35 minutes of clustering for 4096 texels, and that 8-bit maps spoil the former only.
@@ -7,21 +7,31 @@ with chained matrix factorization, 35 minutes of clustering for 4096 texels, and
 from __future__ import annotations
 
 import time
+from importlib import import_module
 
 import numpy as np
 
 from btfref.bench.timing import machine
 from btfref.errors import InputError
 
-#: Name → method and parameters. "as published": no refinement, and 8-bit scales where the maps have 8 bits.
+#: How the paper stores maps: no scales fitted again, linear codes, and 8 bits for the scales too.
+PUBLISHED = {"rescale": False, "code": "linear"}
+
+#: Name → method, parameters of the factorization, parameters of storing.
 VARIANTS = {
-    "cmf, as published": ("cmf", {"sweeps": 0, "rescale": False}),
-    "hf, as published": ("hf", {"rescale": False}),
-    "cmf": ("cmf", {}),
-    "hf": ("hf", {}),
+    "cmf, as published": ("cmf", {"sweeps": 0}, PUBLISHED),
+    "hf, as published": ("hf", {"floor": 1e-3, "bounded": False}, PUBLISHED),
+    "cmf": ("cmf", {}, {}),
+    "hf": ("hf", {}, {}),
 }
 
-STORAGES = ("float", "byte")
+STORAGES = ("float", "half", "byte")
+CLUSTERS = {"unclustered": None, "clustered": 256}
+
+MESOSTRUCTURES = ("checker", "rings", "tissue")
+
+#: Paths a sample of the BTFs whose errors are measured, and of that whose times are.
+SPP, DRAFT_SPP = 16, 2
 
 #: Share of the mean value whose square is the ε of relMSE: below it a sample's error is judged absolutely.
 RELMSE_SHARE = 0.1
@@ -36,59 +46,118 @@ def run(*, quick=False, progress=None, btf=None, only=None):
     Parameters
     ----------
     quick : bool
-        One round instead of three.
+        One round instead of three, and the errors of the BTF that is timed alone.
     progress : callable, optional
     btf : SampledBTF, optional
-        Default: a checker of 64² texels at 8 × 8 views and as many lights, 4096 samples a texel as in the paper.
+        To be timed and judged. Default: times of a checker of 64² texels at 8 × 8 views and as many lights, 4096
+        samples a texel as in the paper; errors of the three mesostructures with 64² texels and 81² directions.
     only : iterable of str, optional
         Of "cmf" and "hf".
 
     Returns
     -------
     dict
-        ``raw``: seconds of factorization (nothing clustered) and of the whole fit with 256 prototypes, per variant;
-        ``rate``: texels a minute and channel of the median; ``clustering``: median seconds that codebooks add;
-        ``errors``: variant → "storage" or "storage, clustered" → rmse, nrmse, relmse, delta_e00.
+        ``raw``: seconds of factorization and of clustering into 256 prototypes a factor, per variant; ``rate``: texels
+        a minute and channel of the median; ``clustering``: median seconds; ``errors``: material → variant → "storage,
+        clustered" or "storage, unclustered" → rmse, nrmse, relmse, delta_e00; ``range``: material → variant → factor →
+        median over texels of peak over median of the map, the largest of the channels.
     """
-    from btfref.registry import method
+    from btfref.representations.factored_storage import cluster
     from btfref.sampling.synthesis import synthesize
 
-    btf = btf or synthesize("checker", texels=64, views="8x8", lights="8x8", spp=2, progress=progress)
     variants = {name: v for name, v in VARIANTS.items() if not only or v[0] in only}
     if not variants:
         raise InputError("nothing to measure", field="--only", got=", ".join(only), expected="cmf or hf")
+    report = progress or (lambda *_: None)
+    timed = btf or synthesize(
+        "checker", texels=64, views="8x8", lights="8x8", spp=DRAFT_SPP, progress=progress
+    )
     rounds = 1 if quick else 3
-    raw, errors = {}, {name: {} for name in variants}
+    raw = {f"{name}, {part}": [] for name in variants for part in ("factorization", "clustering")}
+    kept = {}
     for turn in range(rounds):
-        for name, (key, parameters) in variants.items():
-            for label, clusters in (("factorization", None), ("clustered", 256)):
-                for storage in STORAGES:
-                    if turn and storage != STORAGES[0]:
-                        continue
-                    scales = storage if "published" in name else None
-                    start = time.perf_counter()
-                    fitted = method(key).fit(
-                        btf, clusters=clusters, storage=storage, scale_storage=scales, **parameters
-                    )
-                    seconds = time.perf_counter() - start
-                    if storage == STORAGES[0]:
-                        raw.setdefault(f"{name}, {label}", []).append(seconds)
-                    if not turn:
-                        label_of = storage if clusters is None else f"{storage}, clustered"
-                        errors[name][label_of] = table_errors(fitted, btf)
+        for i, (name, (key, parameters, _)) in enumerate(variants.items()):
+            report(turn * len(variants) + i + 1, rounds * len(variants), f"times: {name}")
+            start = time.perf_counter()
+            kept[name] = factorize(key, timed, parameters)
+            middle = time.perf_counter()
+            cluster(kept[name], CLUSTERS["clustered"])
+            raw[f"{name}, factorization"].append(middle - start)
+            raw[f"{name}, clustering"].append(time.perf_counter() - middle)
     median = {name: float(np.median(times)) for name, times in raw.items()}
-    n_tables = int(np.prod(btf.texels)) * 3
+    n_tables = int(np.prod(timed.texels)) * 3
+    errors, ranges = {}, {}
+    if quick or btf is not None:
+        name = timed.attributes.get("parent", {}).get("name", "measured")
+        errors[name], ranges[name] = judged(timed, variants, kept, report)
+    else:
+        kept.clear()
+        for name in MESOSTRUCTURES:
+            data = synthesize(name, texels=64, spp=SPP, progress=progress)
+            errors[name], ranges[name] = judged(data, variants, {}, report)
     return {
         "suite": "factors",
-        "parameters": {"shape": list(btf.values.shape), "rounds": rounds, "attributes": btf.attributes},
+        "parameters": {
+            "shape": list(timed.values.shape),
+            "rounds": rounds,
+            "attributes": timed.attributes,
+        },
         "raw": raw,
         "rate": {name: n_tables * 60 / median[f"{name}, factorization"] for name in variants},
-        "clustering": {
-            name: median[f"{name}, clustered"] - median[f"{name}, factorization"] for name in variants
-        },
+        "clustering": {name: median[f"{name}, clustering"] for name in variants},
         "errors": errors,
+        "range": ranges,
         "machine": machine(),
     }
+
+
+def factorize(key, btf, parameters):
+    """Factors by one method."""
+    return import_module(f"btfref.representations.{key}").factorize(btf, **parameters)
+
+
+def judged(btf, variants, factors, report):
+    """Errors of every variant and storage on one BTF, and the ranges of the factors' values.
+
+    Parameters
+    ----------
+    btf : SampledBTF
+    variants : dict
+        As ``VARIANTS``.
+    factors : dict of str to btfref.representations.factored_fit.Factors
+        Those of ``btf`` that are there already.
+    report : callable
+
+    Returns
+    -------
+    errors, ranges : dict
+    """
+    from btfref.representations.factored_storage import Storing, cluster, store
+
+    errors, ranges = {}, {}
+    for i, (name, (key, parameters, how)) in enumerate(variants.items()):
+        report(i + 1, len(variants), f"errors: {name}")
+        fitted = factors.get(name) or factorize(key, btf, parameters)
+        errors[name] = {}
+        for label, clusters in CLUSTERS.items():
+            codebooks = cluster(fitted, clusters)
+            if clusters is None:
+                ranges[name] = {factor: spread(maps) for factor, maps in codebooks.prototypes.items()}
+            for storage in STORAGES:
+                # The paper's scale map has the type of the others.
+                scales = storage if how is PUBLISHED else None
+                storing = Storing(clusters, storage, scales, **how)
+                errors[name][f"{storage}, {label}"] = table_errors(store(btf, codebooks, storing), btf)
+    return errors, ranges
+
+
+def spread(maps):
+    """Median over maps of peak over median, the largest of the channels; shape (map, n, n, 3)."""
+    texels = maps.reshape(len(maps), -1, 3)
+    middle = np.median(texels, 1)
+    lit = middle > 0
+    ratio = np.where(lit, texels.max(1) / np.where(lit, middle, 1), np.nan)
+    return float(np.nanmedian(np.nanmax(ratio[lit.any(1)], 1))) if lit.any() else 0.0
 
 
 def table_errors(fitted, btf):
@@ -138,22 +207,28 @@ def table_errors(fitted, btf):
 
 
 def table(result):
-    """Rows for people: variant, rate, clustering, and errors of each storage."""
-    header = ("method", "maps", "texels/min/channel", "clustering s", "RMSE", "NRMSE", "relMSE", "ΔE00")
+    """Rows for people: material, variant, speed, range of Q, and errors of each storage."""
+    header = (
+        "material",
+        "method",
+        "maps",
+        "texels/min/channel",
+        "clustering s",
+        "range of Q",
+        "RMSE",
+        "relMSE",
+        "ΔE00",
+    )
     rows = []
-    for name, storages in result["errors"].items():
-        for storage, e in storages.items():
-            first = storage == STORAGES[0]
-            rows.append(
-                (
-                    name,
-                    storage,
-                    f"{result['rate'][name]:.0f}" if first else "",
-                    f"{result['clustering'][name]:.1f}" if first else "",
-                    f"{e['rmse']:.5f}",
-                    f"{e['nrmse']:.4f}",
-                    f"{e['relmse']:.4f}",
-                    f"{e['delta_e00']:.3f}",
-                )
+    for material, variants in result["errors"].items():
+        for name, storages in variants.items():
+            about = (
+                f"{result['rate'][name]:.0f}",
+                f"{result['clustering'][name]:.1f}",
+                f"{result['range'][material][name]['q']:.0f}",
             )
+            for storage, e in storages.items():
+                figures = (f"{e['rmse']:.5f}", f"{e['relmse']:.4f}", f"{e['delta_e00']:.3f}")
+                rows.append((material, name, storage, *about, *figures))
+                about = ("", "", "")
     return header, rows

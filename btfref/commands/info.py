@@ -10,6 +10,9 @@ from pathlib import Path
 from btfref.commands._shared import bytes_text, emit, emit_json, output_file, ranges
 from btfref.errors import InputError
 
+#: Longer lists are counted; --json has them all.
+MOST_LISTED = 16
+
 _BYTES = ("payload_bytes", "file_bytes", "raw_bytes")
 
 
@@ -174,5 +177,7 @@ def _text(key, fact):
     if key in ("shape", "size") and isinstance(fact, list | tuple):
         return " × ".join(map(str, fact))
     if isinstance(fact, list | tuple):
+        if len(fact) > MOST_LISTED:
+            return f"{len(fact)} values"
         return ", ".join(map(str, fact)) or "none"
     return "–" if fact is None or fact == {} else str(fact)

@@ -131,7 +131,8 @@ def read_info(path):
         ``kind``, ``method``, ``shape`` [views, lights, rows, columns, 3] of the BTF it stands for, ``directions``,
         ``maps`` with the shape, type and bytes of each, ``payload_bytes`` (the maps alone, counted as the papers
         count: no direction tables, an index map at the width its codebook needs), ``file_bytes``, ``raw_bytes`` (the
-        BTF as 32-bit floats), ``ratio``, ``parameters``, ``parent``, ``versions``.
+        BTF as 32-bit floats), ``ratio``, ``parameters``, ``fit`` (what the fit measured of itself),
+        ``parent``, ``versions``.
     """
     manifest, parts = _open(path, header_only=True)
     meta, maps = manifest["meta"], manifest["arrays"]
@@ -155,6 +156,7 @@ def read_info(path):
         "raw_bytes": raw,
         "ratio": raw / payload,
         "parameters": meta["parameters"],
+        "fit": meta.get("fit", {}),
         "parent": meta["parent"],
         "versions": meta["versions"],
     }

@@ -26,8 +26,17 @@ from btfref.representations.factored_storage import Storing, cluster, store
 
 __all__ = ["PRESETS", "Representation", "fit"]
 
-#: "paper": all in 8 bits, scales from the normalisation alone.
-PRESETS = {"paper": {"rescale": False, "storage": "byte", "scale_storage": "byte", "code": "linear"}}
+#: "paper": factors as the system leaves them, all in 8 bits, scales from the normalisation alone.
+PRESETS = {
+    "paper": {
+        "floor": 1e-3,
+        "bounded": False,
+        "rescale": False,
+        "storage": "byte",
+        "scale_storage": "byte",
+        "code": "linear",
+    }
+}
 
 #: Candidates for λ where none is given.
 SMOOTHNESS = (0.3, 1.0, 3.0, 10.0)
@@ -40,6 +49,9 @@ EXPONENT = 0.75
 
 #: Weight of x̃ = 0 in the normal equations: constants can move between the factors freely, and this picks the smallest.
 RIDGE = 1e-6
+
+#: Least weight with which a sample reaches a texel of a map.
+REACHED = 1e-3
 
 #: Logarithms of the factors are clipped here, so that their products stay finite floats; unsupported texels with little
 #: smoothing reach it.
@@ -136,7 +148,8 @@ def fit(
     seed=0,
     progress=None,
     smoothness=None,
-    floor=1e-3,
+    floor=1e-2,
+    bounded=True,
     map_size=32,
     clusters=256,
     storage="half",
@@ -155,7 +168,7 @@ def fit(
         Of the held-out samples and of the clustering.
     progress : callable, optional
         ``progress(done, total, label)``.
-    smoothness, floor, map_size
+    smoothness, floor, bounded, map_size
         Of the factorization: see :func:`factorize`.
     clusters, storage, scale_storage, code, rescale, filter_type
         See :class:`btfref.representations.factored_storage.Storing`.
@@ -173,12 +186,16 @@ def fit(
     """
     storing = Storing(clusters, storage, scale_storage, code, rescale, filter_type)
     step = Steps(progress, len(texel_parts(int(np.prod(btf.texels)))) + 5)
-    factors = factorize(btf, seed=seed, step=step, smoothness=smoothness, floor=floor, map_size=map_size)
+    factors = factorize(
+        btf, seed=seed, step=step, smoothness=smoothness, floor=floor, bounded=bounded, map_size=map_size
+    )
     codebooks = cluster(factors, clusters, seed=seed, step=step)
     return store(btf, codebooks, storing, seed=seed, step=step)
 
 
-def factorize(btf, *, seed=0, step=lambda label: None, smoothness=None, floor=1e-3, map_size=32):
+def factorize(
+    btf, *, seed=0, step=lambda label: None, smoothness=None, floor=1e-2, bounded=True, map_size=32
+):
     """Factors of every texel of ``btf``, not yet clustered.
 
     Parameters
@@ -194,6 +211,10 @@ def factorize(btf, *, seed=0, step=lambda label: None, smoothness=None, floor=1e
     floor : float
         Share of its mean below which a texel's value counts as that much: logarithms need positive numbers, and
         without a floor the least values would rule the fit. A black texel stays black.
+    bounded : bool
+        Texels of a map that no sample reaches, which the smoothing extrapolates, hold at most the largest value of
+        those that one reaches. Differs from the papers (False): what no sample sees is up to 7 times as large, and
+        8-bit codes are spent on it.
     map_size : int
         Texels along a side of a parabolic map, at least 2.
 
@@ -219,13 +240,19 @@ def factorize(btf, *, seed=0, step=lambda label: None, smoothness=None, floor=1e
     step("factorization")
     factor = system.factorize(chosen)
     operators = map_operators(btf.views.vectors, btf.lights.vectors, map_size, False)
+    reached = {
+        name: np.asarray(getattr(operators, name).max(0).todense()).ravel() > REACHED for name in "pqr"
+    }
     log_errors = []
 
     def one_part(data):
         log_data = logarithms(data, floor)
         solution = system.solve(factor, log_data)
         log_errors.append(((system.rows @ solution - log_data) ** 2).mean(0))
-        maps = {name: values[None] for name, values in system.maps(solution).items()}
+        found = system.maps(solution)
+        if bounded:
+            found = {name: np.minimum(m, m[reached[name]].max(0)) for name, m in found.items()}
+        maps = {name: m[None] for name, m in found.items()}
         return maps, {"maps": operators.product(maps)}
 
     maps, errors = factorized(btf, dict.fromkeys("pqr", 1), map_size, step, one_part)
@@ -233,5 +260,10 @@ def factorize(btf, *, seed=0, step=lambda label: None, smoothness=None, floor=1e
         "smoothness": chosen,
         "log_rms": float(np.sqrt(np.concatenate(log_errors).mean())),
     }
-    parameters = {"smoothness": smoothness, "floor": floor, "map_size": map_size}
+    parameters = {
+        "smoothness": smoothness,
+        "floor": floor,
+        "bounded": bounded,
+        "map_size": map_size,
+    }
     return Factors("hf", maps, EXPONENT, parameters, facts)

@@ -13,6 +13,7 @@ FORMS = {
     "cmf-float": ("cmf", {"storage": "float"}),
     "cmf-byte": ("cmf", {"storage": "byte"}),
     "cmf-all-bytes": ("cmf", {"storage": "byte", "scale_storage": "byte"}),
+    "cmf-linear-bytes": ("cmf", {"storage": "byte", "scale_storage": "byte", "code": "linear"}),
     "cmf-four": ("cmf", {"difference": True}),
     "cmf-four-terms-byte": ("cmf", {"difference": True, "terms": 2, "storage": "byte"}),
     "cmf-terms": ("cmf", {"terms": 3}),

@@ -11,7 +11,7 @@ from btfref.errors import InputError
 from btfref.numerics import factoring, halfway, parabolic
 from btfref.numerics.directions import directions
 from btfref.registry import methods
-from btfref.representations import cmf, factored_fit, hf, load, read_info, save
+from btfref.representations import cmf, factored_fit, hf
 from btfref.sampling import SampledBTF
 
 KEYS = ("cmf", "hf")
@@ -208,6 +208,17 @@ def test_hf_factors_its_matrix_once_and_chooses_the_best_smoothness(monkeypatch)
     assert found["held_out"][str(found["smoothness"])] == min(found["held_out"].values())
 
 
+def test_hf_bounds_what_no_sample_reaches():
+    """Elsewhere the maps are the same; beyond the samples the smoothing extrapolates to more."""
+    btf = oracle_btf((5, 4))
+    free, bounded = (hf.factorize(btf, smoothness=0.3, bounded=b).maps["q"][:, 0] for b in (False, True))
+    operators = factored_fit.map_operators(btf.views.vectors, btf.lights.vectors, 32, False)
+    reached = (operators.q.max(0).toarray().ravel() > hf.REACHED).reshape(32, 32)
+    np.testing.assert_array_equal(free[:, reached], bounded[:, reached])
+    assert (bounded.max((1, 2)) == free[:, reached].max(1)).all()
+    assert (free.max((1, 2)) > bounded.max((1, 2))).any()
+
+
 def test_eight_bits_hardly_touch_cmf():
     btf = oracle_btf((12, 10))
     for parameters in ({}, {"sweeps": 0, "rescale": False}):
@@ -215,94 +226,6 @@ def test_eight_bits_hardly_touch_cmf():
             s: fit("cmf", btf, storage=s, **parameters).meta["fit"]["error"] ** 0.5 for s in ("float", "byte")
         }
         assert error["byte"] <= tolerance("factored.eight_bits.ratio") * error["float"]
-
-
-# --- storage -----------------------------------------------------------------------------------------------------
-
-
-def sparse_btf(shape, dtype="float16"):
-    """Many texels, few directions."""
-    w = directions("ubo81").vectors[[0, 1, 3, 5]]
-    return oracle_btf(shape, w, w, dtype)
-
-
-def test_byte_counts_are_those_of_the_paper(tmp_path):
-    """2.25 MiB for three codebooks of 256 maps of 32² RGB bytes, 36 MiB unclustered for 64² texels."""
-    btf = sparse_btf((64, 64))
-    for clusters, mebibytes in ((256, 2.25), (None, 36)):
-        fitted = cmf.fit(btf, clusters=clusters, storage="byte", scale_storage="byte", sweeps=0)
-        path = tmp_path / f"{clusters}.cmf.exr"
-        save(fitted, path)
-        info = read_info(path)
-        books = {name: m for name, m in info["maps"].items() if name.startswith("factor_")}
-        assert sum(m["bytes"] for m in books.values()) == mebibytes * 2**20
-        width = 1 if clusters else 2
-        assert info["maps"]["index"]["bytes"] == 64 * 64 * 3 * width
-        assert info["maps"]["scale_map"]["bytes"] == 64 * 64 * 3
-        assert info["payload_bytes"] == mebibytes * 2**20 + 64 * 64 * 3 * (width + 1) + 12
-
-
-@pytest.mark.parametrize("storage", ["float", "half", "byte"])
-@pytest.mark.parametrize("key", KEYS)
-def test_files_keep_every_value(key, storage, tmp_path):
-    fitted = fit(key, sparse_btf((5, 6)), storage=storage, clusters=8)
-    save(fitted, tmp_path / "a.exr")
-    back = load(tmp_path / "a.exr")
-    assert (
-        fitted.maps["factor_q"].dtype == {"float": np.float32, "half": np.float16, "byte": np.uint8}[storage]
-    )
-    for name, array in fitted.arrays().items():
-        assert back.maps[name].dtype == array.dtype
-        np.testing.assert_array_equal(back.maps[name], array)
-    assert back.meta == fitted.meta
-
-
-def test_codebooks_are_bounded_and_deterministic():
-    btf = oracle_btf((9, 8))
-    a, b = (fit("cmf", btf, clusters=10, seed=3) for _ in range(2))
-    for name in a.maps:
-        np.testing.assert_array_equal(a.maps[name], b.maps[name])
-    assert len(a.maps["factor_p"]) <= 10
-    assert a.maps["index"].max() < 10
-    every = fit("cmf", btf, clusters=None)
-    assert every.meta["fit"]["error"] < a.meta["fit"]["error"]
-
-
-def alternating(fitted):
-    """Slices of 0 and 1 in turn, every texel on a slice of ones: any leak between slices darkens it."""
-    maps = dict(fitted.maps)
-    for name in ("factor_p", "factor_q", "factor_r"):
-        ones = np.ones_like(maps[name]) * (255 if maps[name].dtype == np.uint8 else 1)
-        maps[name] = ones * (np.arange(len(ones)) % 2).astype(ones.dtype)[:, None, None, None]
-    maps["index"] = np.minimum(maps["index"] | 1, len(maps["factor_p"]) - 1).astype(np.uint32) | 1
-    top = 255 if maps["scale_map"].dtype == np.uint8 else 1
-    maps["scale_map"] = np.full_like(maps["scale_map"], top)
-    maps["scale_peak"] = np.ones_like(maps["scale_peak"])
-    return dataclasses.replace(fitted, maps=maps)
-
-
-@pytest.mark.parametrize("storage", ["half", "byte"])
-def test_no_slice_leaks_into_another(storage, llvm, need, rng, tmp_path):
-    import drjit as dr
-
-    import mitsuba_plugins
-    from btfref.render.probe import probe
-
-    need("gl")
-    fitted = alternating(fit("cmf", oracle_btf((6, 6)), clusters=8, storage=storage))
-    assert len(fitted.maps["factor_p"]) == 8
-    w = upper(rng, 4000).astype(np.float32)
-    w_view = upper(rng, 4000).astype(np.float32)
-    uv = rng.random((4000, 2)).astype(np.float32)
-    expected = np.minimum(w[:, 2:] / fitted.meta["constants"]["light_cos_last"], 1) * np.ones(3)
-    save(fitted, tmp_path / "a.exr")
-    mitsuba_plugins.register()
-    bsdf = llvm.load_dict({"type": "btf", "filename": str(tmp_path / "a.exr")})
-    si = dr.zeros(llvm.SurfaceInteraction3f, len(uv))
-    si.uv, si.wi = llvm.Point2f(uv.T), llvm.Vector3f(w_view.T)
-    port = np.array(bsdf.eval(llvm.BSDFContext(), si, llvm.Vector3f(w.T))).T
-    for value in (fitted.evaluate(uv, w, w_view), probe(fitted, uv, w, w_view), port):
-        np.testing.assert_allclose(value, expected, atol=tolerance("probe.agreement.p999"))
 
 
 # --- bad data ----------------------------------------------------------------------------------------------------
