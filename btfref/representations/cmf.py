@@ -26,13 +26,12 @@ from btfref.numerics.parabolic import texel_directions
 from btfref.representations.factored import Representation, light_fade, texel_parts
 from btfref.representations.factored_fit import (
     Factors,
-    Steps,
     checked_map_size,
     checked_ranges,
     factorized,
     map_operators,
 )
-from btfref.representations.factored_storage import Storing, cluster, store
+from btfref.representations.factored_storage import Storing, fitted
 from btfref.representations.lookup import positive_integer
 
 __all__ = ["PRESETS", "Representation", "fit"]
@@ -231,20 +230,21 @@ def fit(
         For parameters out of range, or a value that is not finite.
     """
     storing = Storing(clusters, storage, scale_storage, code, rescale, filter_type)
-    step = Steps(progress, len(texel_parts(int(np.prod(btf.texels)))) + 4 + bool(difference))
-    factors = factorize(
-        btf,
-        step=step,
-        difference=difference,
-        terms=terms,
-        sweeps=sweeps,
-        exponent=exponent,
-        floor=floor,
-        half_step=half_step,
-        map_size=map_size,
-    )
-    codebooks = cluster(factors, clusters, seed=seed, step=step)
-    return store(btf, codebooks, storing, seed=seed, step=step)
+
+    def factors(step):
+        return factorize(
+            btf,
+            step=step,
+            difference=difference,
+            terms=terms,
+            sweeps=sweeps,
+            exponent=exponent,
+            floor=floor,
+            half_step=half_step,
+            map_size=map_size,
+        )
+
+    return fitted(btf, factors, storing, seed=seed, progress=progress, more_steps=5 + bool(difference))
 
 
 def factorize(

@@ -17,7 +17,7 @@ from btfref.representations.factored import (
     index_slots,
     texel_parts,
 )
-from btfref.representations.factored_fit import map_operators, unit_tables
+from btfref.representations.factored_fit import Steps, map_operators, unit_tables
 from btfref.representations.lookup import base_meta, direction_arrays, stored
 
 #: Storage of the maps: floats, halves, or 8-bit codes of [0, 1].
@@ -146,6 +146,30 @@ def stored_maps(name, maps, storage, power):
     if storage == "byte":
         return np.rint(np.clip(maps, 0, 1) * 255).astype(np.uint8)
     return stored(name, maps, storage)
+
+
+def fitted(btf, factorize, storing, *, seed, progress, more_steps):
+    """A whole fit: factors, codebooks, storage.
+
+    Parameters
+    ----------
+    btf : SampledBTF
+    factorize : callable
+        ``step -> Factors``; calls ``step(label)`` for each part of the texels and for what else it does.
+    storing : Storing
+    seed : int
+    progress : callable or None
+        ``progress(done, total, label)``.
+    more_steps : int
+        Besides the parts of the texels: calls of ``factorize``, factors to cluster, and one for the scales.
+
+    Returns
+    -------
+    Representation
+    """
+    step = Steps(progress, len(texel_parts(int(np.prod(btf.texels)))) + more_steps)
+    codebooks = cluster(factorize(step), storing.clusters, seed=seed, step=step)
+    return store(btf, codebooks, storing, seed=seed, step=step)
 
 
 @dataclass(frozen=True)

@@ -12,17 +12,16 @@ from __future__ import annotations
 import numpy as np
 
 from btfref.numerics.parabolic import texel_centres
-from btfref.representations.factored import Representation, texel_parts
+from btfref.representations.factored import Representation
 from btfref.representations.factored_fit import (
     Factors,
-    Steps,
     checked_map_size,
     checked_ranges,
     factorized,
     map_operators,
     unit_tables,
 )
-from btfref.representations.factored_storage import Storing, cluster, store
+from btfref.representations.factored_storage import Storing, fitted
 
 __all__ = ["PRESETS", "Representation", "fit"]
 
@@ -185,12 +184,13 @@ def fit(
         For parameters out of range, or a value that is not finite.
     """
     storing = Storing(clusters, storage, scale_storage, code, rescale, filter_type)
-    step = Steps(progress, len(texel_parts(int(np.prod(btf.texels)))) + 5)
-    factors = factorize(
-        btf, seed=seed, step=step, smoothness=smoothness, floor=floor, bounded=bounded, map_size=map_size
-    )
-    codebooks = cluster(factors, clusters, seed=seed, step=step)
-    return store(btf, codebooks, storing, seed=seed, step=step)
+
+    def factors(step):
+        return factorize(
+            btf, seed=seed, step=step, smoothness=smoothness, floor=floor, bounded=bounded, map_size=map_size
+        )
+
+    return fitted(btf, factors, storing, seed=seed, progress=progress, more_steps=6)
 
 
 def factorize(

@@ -121,6 +121,15 @@ def test_mini_batches_make_codebooks_nearly_as_good(rng, monkeypatch):
     assert max(error.values()) <= tolerance("factored.mini_batch.share") * spread
 
 
+@pytest.mark.parametrize(("key", "form"), [("cmf", {}), ("cmf", {"difference": True}), ("hf", {})])
+def test_progress_ends_when_the_work_does(key, form):
+    calls = []
+    fit(key, oracle_btf((7, 6)), progress=lambda *call: calls.append(call), **form)
+    done, total, _ = zip(*calls, strict=True)
+    assert done == tuple(range(1, len(calls) + 1))
+    assert set(total) == {len(calls)}
+
+
 def test_info_reports_what_the_fit_measured(tmp_path):
     from btfref.commands import info
 
