@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from btfref.representations.factored import FACTORS, index_slots
+from btfref.representations.factored import FACTORS, index_slots, raised
 from mitsuba_plugins.lookup import read_packets, texel_stencil, wide
 from mitsuba_plugins.parabolic import ParabolicMaps, bilinear_stencil, half_difference, unpacked
 
@@ -45,7 +45,7 @@ class Evaluator:
             colour = mi.Color3f(*colour) * factor
         else:
             colour = mi.Color3f(*(mi.Float(c) for c in read_packets(values, at, 4, active)[:3]))
-        return colour * colour if power == 2 else colour
+        return raised(colour, power)
 
     def _value(self, texel, stencils, active):
         """B of one texel but for the fall to the horizon."""

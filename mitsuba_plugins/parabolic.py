@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from btfref.representations.factored import raised
 from mitsuba_plugins.lookup import HALF_SCALE, HALF_SHIFT, read_packets, wide, widened
 
 
@@ -54,7 +55,7 @@ class ParabolicMaps:
     ----------
     values : TensorXf, TensorXf16, shape (slices, n, n, 4), or TensorXu of packed codes, shape (slices, n, n, 1)
     power : int
-        1 or 2: what the numbers in the maps are raised to.
+        1 or 4: what the numbers in the maps are raised to.
     """
 
     def __init__(self, values, power):
@@ -87,8 +88,7 @@ class ParabolicMaps:
         total = [mi.Float(0)] * 3
         for index, weight in zip(*stencil, strict=True):
             colour, factor = self._texel(first + index, active)
-            if self.power == 2:
-                colour, factor = [c * c for c in colour], factor * factor
+            colour, factor = [raised(c, self.power) for c in colour], factor**self.power
             total = [dr.fma(c, weight, t) for c, t in zip(colour, total, strict=True)]
         return mi.Color3f(*total) * factor
 

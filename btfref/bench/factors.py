@@ -14,7 +14,7 @@ import numpy as np
 from btfref.bench.timing import machine
 from btfref.errors import InputError
 
-#: How the paper stores maps: no scales fitted again, linear codes, and 8 bits for the scales too.
+#: How the paper stores maps: no scales fitted again, linear codes.
 PUBLISHED = {"rescale": False, "code": "linear"}
 
 #: Name → method, parameters of the factorization, parameters of storing.
@@ -144,9 +144,7 @@ def judged(btf, variants, factors, report):
             if clusters is None:
                 ranges[name] = {factor: spread(maps) for factor, maps in codebooks.prototypes.items()}
             for storage in STORAGES:
-                # The paper's scale map has the type of the others.
-                scales = storage if how is PUBLISHED else None
-                storing = Storing(clusters, storage, scales, **how)
+                storing = Storing(clusters, storage, **how)
                 errors[name][f"{storage}, {label}"] = table_errors(store(btf, codebooks, storing), btf)
     return errors, ranges
 

@@ -37,9 +37,7 @@ from btfref.representations.lookup import positive_integer
 __all__ = ["PRESETS", "Representation", "fit"]
 
 #: "paper": factors as the chain leaves them, all in 8 bits, scales from the normalisation alone.
-PRESETS = {
-    "paper": {"sweeps": 0, "rescale": False, "storage": "byte", "scale_storage": "byte", "code": "linear"}
-}
+PRESETS = {"paper": {"sweeps": 0, "rescale": False, "storage": "byte", "code": "linear"}}
 
 #: Step of the difference directions in degrees: the paper's 8 polar angles.
 DIFFERENCE_STEP = 11.25
@@ -199,7 +197,7 @@ def fit(
     clusters=256,
     storage="half",
     scale_storage=None,
-    code="square",
+    code="fourth",
     rescale=True,
     filter_type="bilinear",
 ):

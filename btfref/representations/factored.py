@@ -32,7 +32,7 @@ class Representation(StoredMaps):
     ``index`` [row, column, channel] uint32: a prototype for each term of P, then of Q, R and D; ``scale_map``
     [row, column, term, 3] in [0, 1] times ``scale_peak`` [term, 3]; ``half_scale`` [row, column, term, 3] with more
     than one term of Q · D. uint8 maps hold 255 times their numbers. The constants ``map_power`` and ``scale_power``
-    are 1 or 2: what the numbers in the maps, and in the map of scales, are raised to.
+    are 1 or 4: what the numbers in the maps, and in the map of scales, are raised to.
     """
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
@@ -172,11 +172,19 @@ def light_fade(w_light, cos_last):
 
 
 def decoded(array, power, dtype=float):
-    """Values of a stored map: what is stored (of uint8 a 255th) to the ``power`` of 1 or 2."""
+    """Values of a stored map: what is stored (of uint8 a 255th) to the ``power`` of 1 or 4."""
     values = array.astype(dtype)
     if array.dtype == np.uint8:
         values /= dtype(255)
-    return values * values if power == 2 else values
+    return raised(values, power)
+
+
+def raised(values, power):
+    """``values`` to the power of 1 or 4."""
+    if power == 1:
+        return values
+    squares = values * values
+    return squares * squares
 
 
 def batch_last(maps):

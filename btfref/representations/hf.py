@@ -32,7 +32,6 @@ PRESETS = {
         "bounded": False,
         "rescale": False,
         "storage": "byte",
-        "scale_storage": "byte",
         "code": "linear",
     }
 }
@@ -153,7 +152,7 @@ def fit(
     clusters=256,
     storage="half",
     scale_storage=None,
-    code="square",
+    code="fourth",
     rescale=True,
     filter_type="bilinear",
 ):

@@ -22,9 +22,10 @@ Stencil parabolic_stencil(vec3 w, int n) {
         vec4((1.0 - f.x) * (1.0 - f.y), f.x * (1.0 - f.y), (1.0 - f.x) * f.y, f.x * f.y));
 }
 
-// What a stored number stands for; the power is 1 or 2. The square spreads 8-bit codes over the dark values.
+// What a stored number stands for; the power is 1 or 4. The fourth power spreads 8-bit codes over the dark values.
 vec3 raised(vec4 stored, int power) {
-    return power == 2 ? stored.rgb * stored.rgb : stored.rgb;
+    vec3 square = stored.rgb * stored.rgb;
+    return power == 4 ? square * square : stored.rgb;
 }
 
 // The slice is a whole number and its texels are fetched one by one, so that no neighbouring slice leaks in.

@@ -12,8 +12,8 @@ from btfref.representations import save
 FORMS = {
     "cmf-float": ("cmf", {"storage": "float"}),
     "cmf-byte": ("cmf", {"storage": "byte"}),
-    "cmf-all-bytes": ("cmf", {"storage": "byte", "scale_storage": "byte"}),
-    "cmf-linear-bytes": ("cmf", {"storage": "byte", "scale_storage": "byte", "code": "linear"}),
+    "cmf-byte-half": ("cmf", {"storage": "byte", "scale_storage": "half"}),
+    "cmf-linear-bytes": ("cmf", {"storage": "byte", "code": "linear"}),
     "cmf-four": ("cmf", {"difference": True}),
     "cmf-four-terms-byte": ("cmf", {"difference": True, "terms": 2, "storage": "byte"}),
     "cmf-terms": ("cmf", {"terms": 3}),
