@@ -31,6 +31,9 @@ class Method:
         GLSL file with ``btf_eval``, relative to a shader directory.
     shader_package : str
         Package that holds the shader directory ("" for btfref's own).
+    image_light : str
+        ``module:class`` of the prefiltered path for environments, as in :mod:`btfref.render.image_light`; "" if the
+        method has none.
     """
 
     key: str
@@ -40,6 +43,7 @@ class Method:
     plugin: str
     shader: str
     shader_package: str = ""
+    image_light: str = ""
 
     @property
     def representation(self):
@@ -57,7 +61,7 @@ class Method:
         return import_module(self.module).PRESETS
 
 
-def _row(key, title, paper, *, ports=None):
+def _row(key, title, paper, *, ports=None, image_light=None):
     """A row of btfref's own; ``ports`` names the method whose ports evaluate the same maps."""
     return Method(
         key,
@@ -66,6 +70,7 @@ def _row(key, title, paper, *, ports=None):
         module=f"btfref.representations.{key}",
         plugin=f"mitsuba_plugins.{ports or key}",
         shader=f"representations/{ports or key}.glsl",
+        image_light=f"btfref.render.image_light:{image_light}" if image_light else "",
     )
 
 
@@ -73,10 +78,30 @@ _ROWS = (
     _row("raw", "Tabulated BTF, interpolated", "Dana et al. 1999"),
     _row("svd", "Global truncated singular value decomposition", "Koudelka et al. 2003"),
     _row("lpca", "Local PCA (eigen-BRDFs per cluster)", "Müller, Meseth, Klein 2003 and 2004"),
-    _row("rf_poly", "Reflectance fields: biquadratic polynomials per view", "Meseth, Müller, Klein 2004"),
-    _row("rf_lobes", "Reflectance fields: cosine lobes per view", "Meseth, Müller, Klein 2004"),
-    _row("lafortune", "Generalized cosine lobes per texel", "Lafortune et al. 1997, McAllister et al. 2002"),
-    _row("lafortune_lut", "Lafortune lobes times a table over views", "Daubert et al. 2001"),
+    _row(
+        "rf_poly",
+        "Reflectance fields: biquadratic polynomials per view",
+        "Meseth, Müller, Klein 2004",
+        image_light="Polynomials",
+    ),
+    _row(
+        "rf_lobes",
+        "Reflectance fields: cosine lobes per view",
+        "Meseth, Müller, Klein 2004",
+        image_light="Lobes",
+    ),
+    _row(
+        "lafortune",
+        "Generalized cosine lobes per texel",
+        "Lafortune et al. 1997, McAllister et al. 2002",
+        image_light="Lafortune",
+    ),
+    _row(
+        "lafortune_lut",
+        "Lafortune lobes times a table over views",
+        "Daubert et al. 2001",
+        image_light="LafortuneTable",
+    ),
     _row("cmf", "Chained matrix factorization, clustered", "Suykens, vom Berge, Lagae, Dutré 2003"),
     _row("hf", "Homomorphic factorization, clustered", "McCool, Ang, Ahmad 2001", ports="cmf"),
 )
@@ -118,3 +143,25 @@ def method(key, *, file=None):
     if key not in rows:
         raise InputError("unknown method", file=file, got=repr(key), expected=f"one of {', '.join(rows)}")
     return rows[key]
+
+
+def image_light(key, *, file=None):
+    """The class of a method's prefiltered path for environments.
+
+    Raises
+    ------
+    InputError
+        When the method has none.
+    """
+    row = method(key, file=file)
+    if not row.image_light:
+        having = ", ".join(name for name, other in methods().items() if other.image_light)
+        raise InputError(
+            "environments need a prefiltered path, which the method lacks",
+            file=file,
+            field="method",
+            got=key,
+            expected=f"one of {having}",
+        )
+    module, _, name = row.image_light.partition(":")
+    return getattr(import_module(module), name)

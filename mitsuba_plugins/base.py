@@ -87,6 +87,8 @@ def make_bsdf():
         scale      float     factor of the reflectance, ≥ 0; default 1
         to_uv      transform of the texture coordinates; its rotation also turns the local frame
         sampling   string    "data" (default): light directions by the data; "cosine": by the cosine, for comparison
+        views      string    indices of the measured views to keep, such as "0 3 17"; default: all. A lookup that needs
+                             another one gives no number
         ========== ========= ==================================================================================
 
         Values hold the light's cosine already. The surface reflects on its front side only; wrap it in
@@ -100,7 +102,10 @@ def make_bsdf():
             self.filename = _parameter(props, "filename", None)
             if self.filename is None:
                 raise InputError("the plugin 'btf' needs a file", field="filename")
-            representation = load(str(mi.file_resolver().resolve(str(self.filename))))
+            representation = load(
+                str(mi.file_resolver().resolve(str(self.filename))),
+                views=_indices(_parameter(props, "views", None)),
+            )
             own = representation.meta["filter_type"]
             self.filter_type = _choice(props, "filter_type", own, FILTER_TYPES)
             sampling = _choice(props, "sampling", "data", ("data", "cosine"))
@@ -218,6 +223,16 @@ def _choice(props, name, default, choices):
             "unknown value of a parameter", field=name, got=repr(value), expected=" or ".join(choices)
         )
     return value
+
+
+def _indices(text):
+    """Whole numbers of a text, separated by spaces or commas; None for None."""
+    if text is None:
+        return None
+    try:
+        return [int(word) for word in str(text).replace(",", " ").split()]
+    except ValueError:
+        raise InputError("not a list of views", field="views", got=repr(text)) from None
 
 
 def _matrix(transform):

@@ -9,6 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from btfref.numerics.interpolation import MISSING
+
 #: Half tables are multiplied by this power of two when they are packed: the smallest subnormal half becomes normal.
 HALF_SHIFT = 2.0**10
 
@@ -225,11 +227,36 @@ class TriangleTable:
         return [Neighbour(i, x) for i, x in zip(indices, weights, strict=True)]
 
 
+class ResidentTable:
+    """Port of :class:`btfref.numerics.interpolation.ResidentInterpolation`: views that are not kept give no number."""
+
+    def __init__(self, inner, slots):
+        self.inner, self.slots = inner, mi.UInt32(np.ascontiguousarray(slots[:, 0]))
+        dr.eval(self.slots)
+
+    def stencil(self, w, *, hold=True):
+        """As the table's own, in slots."""
+
+        def kept(index, weight):
+            slot = dr.gather(mi.UInt32, self.slots, index)
+            absent = slot == MISSING
+            return dr.select(absent, 0, slot), dr.select(absent & (weight > 0), dr.nan, weight)
+
+        result = []
+        for neighbour in self.inner.stencil(w, hold=hold):
+            pairs = [kept(*pair) for pair in neighbour.single()]
+            result.append(Neighbour(*(value for pair in pairs for value in pair)))
+        return result
+
+
 def direction_table(arrays, prefix):
     """The port of the interpolation whose tables are stored under ``prefix``."""
     if f"{prefix}_rings" in arrays:
-        return RingTable(arrays[f"{prefix}_rings"])
-    return TriangleTable(arrays[f"{prefix}_triangles"], arrays[f"{prefix}_cells"])
+        found = RingTable(arrays[f"{prefix}_rings"])
+    else:
+        found = TriangleTable(arrays[f"{prefix}_triangles"], arrays[f"{prefix}_cells"])
+    slots = arrays.get(f"{prefix}_slots")
+    return found if slots is None else ResidentTable(found, slots)
 
 
 def tensor(array):

@@ -1,7 +1,8 @@
 """Render a Mitsuba scene with OpenGL: the real-time image.
 
-Meshes with BTF materials, a perspective camera, directional and point lights. No cast shadows: compare with
-`btfref render --noise-free N --no-shadows`. The image is the mean of a regular sub-pixel grid (--grid).
+Meshes with BTF materials, a perspective camera, directional and point lights, and an envmap or constant emitter for
+methods with a prefiltered path. No cast shadows: compare with `btfref render --noise-free N --no-shadows`. The image is
+the mean of a regular sub-pixel grid (--grid).
 """
 
 from __future__ import annotations
@@ -27,6 +28,12 @@ def add_arguments(parser):
     )
     parser.add_argument("--grid", type=count(1), default=4, metavar="N", help="N × N sub-pixels (default 4)")
     parser.add_argument("--size", type=size, metavar="WxH", help="of the image, in pixels")
+    parser.add_argument(
+        "--views",
+        choices=("all", "needed"),
+        default="all",
+        help="measured views to keep in memory: all, or those that the camera can see",
+    )
     parser.add_argument("--png", action="store_true", help="also write X.png, for eyes")
     parser.add_argument("--json", action="store_true", help="print frame time and OpenGL renderer as JSON")
 
@@ -38,7 +45,7 @@ def run(args):
 
     from btfref.render.realtime import realtime
 
-    result = realtime(scene, parameters=parameters, grid=args.grid, size=args.size)
+    result = realtime(scene, parameters=parameters, grid=args.grid, size=args.size, views=args.views)
     write_images(result.image, out, png=args.png)
     if args.json:
         emit_json(result.meta)

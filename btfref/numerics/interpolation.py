@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from btfref.errors import InputError
 from btfref.numerics.parabolic import hemisphere_to_square
 
 #: Columns of a row of ``triangles``: vertices a and b, dual normals of a, b and c, indices, neighbours, padding.
@@ -224,8 +225,51 @@ def _start_cells(interpolation):
     return interpolation.locate(square_to_hemisphere(np.stack([s, t], -1))).astype(np.float32)
 
 
+#: Slot of a sample that is not kept.
+MISSING = 0xFFFFFFFF
+
+
+class ResidentInterpolation:
+    """An interpolation of which only some samples are kept: its indices are slots.
+
+    Parameters
+    ----------
+    inner : RingInterpolation or TriangleInterpolation
+    slots : ndarray of uint32, shape (n_views, 1)
+    """
+
+    def __init__(self, inner, slots):
+        self.inner, self.slots = inner, slots[:, 0].astype(np.int64)
+
+    def stencil(self, w, **settings):
+        """As the interpolation's own, in slots.
+
+        Raises
+        ------
+        InputError
+            When a view with weight is not kept.
+        """
+        index, weight = self.inner.stencil(w, **settings)
+        slot = self.slots[index]
+        absent = slot == MISSING
+        needed = absent & (weight > 0)
+        if needed.any():
+            raise InputError(
+                "a lookup needs views that are not resident",
+                field="views",
+                got=", ".join(map(str, np.unique(index[needed])[:8])),
+            )
+        return np.where(absent, 0, slot), weight
+
+
 def from_arrays(arrays, prefix):
-    """The interpolation whose tables are stored under ``prefix`` (see :meth:`RingInterpolation.arrays`)."""
+    """The interpolation whose tables are stored under ``prefix`` (see :meth:`RingInterpolation.arrays`).
+
+    With a table ``{prefix}_slots`` its samples are the slots of what is kept: :class:`ResidentInterpolation`.
+    """
     if f"{prefix}_rings" in arrays:
-        return RingInterpolation(arrays[f"{prefix}_rings"])
-    return TriangleInterpolation(arrays[f"{prefix}_triangles"], arrays[f"{prefix}_cells"])
+        found = RingInterpolation(arrays[f"{prefix}_rings"])
+    else:
+        found = TriangleInterpolation(arrays[f"{prefix}_triangles"], arrays[f"{prefix}_cells"])
+    slots = arrays.get(f"{prefix}_slots")
+    return found if slots is None else ResidentInterpolation(found, slots)

@@ -13,6 +13,7 @@ import numpy as np
 
 from btfref.errors import BtfrefError, InputError, MissingDependencyError
 from btfref.render import composer
+from btfref.representations.lookup import packed_arrays
 
 #: Texels of a row of a table's texture; shaders/lib/table.glsl takes the index apart with the same number.
 TABLE_WIDTH = 4096
@@ -121,13 +122,29 @@ class ShaderRepresentation:
     directories: list
 
     @classmethod
-    def upload(cls, ctx, rep, *, filter_type=None):
-        """Put ``rep`` on the GPU; ``filter_type`` overrides the file's texel filter."""
-        return cls(
-            {name: upload(ctx, array, name) for name, array in rep.port_arrays().items()},
-            shader_defines(rep, filter_type=filter_type),
-            *shader_file(rep),
-        )
+    def upload(cls, ctx, rep, *, filter_type=None, environment=None):
+        """Put ``rep`` on the GPU; ``filter_type`` overrides the file's texel filter.
+
+        With an environment, what its method's prefiltered path needs comes along, and the shader is the one with
+        ``btf_environment``.
+        """
+        defines = shader_defines(rep, filter_type=filter_type)
+        shader, directories = shader_file(rep)
+        arrays = rep.port_arrays()
+        if environment is not None:
+            from btfref.registry import image_light
+
+            light = image_light(rep.meta["method"])
+            tables = light.tables(rep, environment)
+            defines |= {
+                f"{name}_DIM{axis}".upper(): n
+                for name, table in tables.items()
+                for axis, n in enumerate(table.shape)
+            }
+            arrays = {**arrays, **packed_arrays(tables)}
+            shader, defines["HAS_ENVIRONMENT"] = light.SHADER, True
+        textures = {name: upload(ctx, array, name) for name, array in arrays.items()}
+        return cls(textures, defines, shader, directories)
 
     def program(self, ctx, vertex, fragment=None, *, varyings=(), defines=None):
         """Compile hosts with this representation; see :func:`compile_program`."""

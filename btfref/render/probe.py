@@ -31,24 +31,65 @@ def probe(rep, uv, w_light, w_view, lod=0.0, *, filter_type=None):
     MissingDependencyError
         Without an OpenGL driver.
     """
-    ctx = gl.context()
     points, _ = broadcast_points(uv, w_light, w_view, lod)
+    names = {"uv": 2, "w_light": 3, "w_view": 3, "lod": 1}
+    tables = gl.ShaderRepresentation.upload(gl.context(), rep, filter_type=filter_type)
+    return _transformed(tables, "hosts/probe.vert", names, points)
+
+
+def probe_environment(rep, environment, uv, w_view, to_world, *, filter_type=None):
+    """Radiance of ``rep`` under an environment, computed by its shader.
+
+    Parameters
+    ----------
+    rep : Representation
+        Of a method with a prefiltered path.
+    environment : btfref.render.environment.Environment
+    uv : array_like, shape (N, 2)
+    w_view : array_like, shape (N, 3)
+        Local frame.
+    to_world : array_like, shape (N, 3, 3)
+        Columns: the local axes in world space.
+    filter_type : {"nearest", "bilinear"}, optional
+
+    Returns
+    -------
+    ndarray of float32, shape (N, 3)
+
+    Raises
+    ------
+    MissingDependencyError
+        Without an OpenGL driver.
+    InputError
+        For a method without a prefiltered path.
+    """
+    axes = np.swapaxes(np.asarray(to_world, np.float32), 1, 2).reshape(-1, 9)
+    points = np.concatenate([np.asarray(uv, np.float32), np.asarray(w_view, np.float32), axes], 1)
+    names = {"uv": 2, "w_view": 3, "axis_x": 3, "axis_y": 3, "axis_z": 3}
+    tables = gl.ShaderRepresentation.upload(
+        gl.context(), rep, filter_type=filter_type, environment=environment
+    )
+    return _transformed(tables, "hosts/probe_environment.vert", names, points)
+
+
+def _transformed(tables, host, names, points):
+    """``value`` of a vertex host for rows of attributes; the tables are released."""
+    ctx = gl.context()
     if not len(points):
+        tables.release()
         return np.zeros((0, 3), np.float32)
-    tables = gl.ShaderRepresentation.upload(ctx, rep, filter_type=filter_type)
     # Without a bound framebuffer transform feedback on a surfaceless context returns zeros, without an error.
     target = ctx.simple_framebuffer((1, 1))
     target.use()
-    program = tables.program(ctx, "hosts/probe.vert", varyings=("value",))
+    program = tables.program(ctx, host, varyings=("value",))
     gl.bind(program, tables.textures)
-    attributes = [("uv", "2f", 0), ("w_light", "3f", 2), ("w_view", "3f", 5), ("lod", "1f", 8)]
-    content = []
-    buffers = []
-    for name, form, start in attributes:
+    content, buffers, start = [], [], 0
+    for name, width in names.items():
         if name in program:
-            columns = np.ascontiguousarray(points[:, start : start + int(form[0])])
+            columns = np.ascontiguousarray(points[:, start : start + width])
             buffers.append(ctx.buffer(columns.tobytes()))
-            content.append((buffers[-1], form, name))
+            content.append((buffers[-1], f"{width}f", name))
+        start += width
     vertices = ctx.vertex_array(program, content)
     result = ctx.buffer(reserve=12 * len(points))
     vertices.transform(result, mode=ctx.POINTS, vertices=len(points))

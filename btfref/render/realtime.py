@@ -1,7 +1,8 @@
 """The real-time renderer: the same scene through GLSL, without a window.
 
-Direct light of directional and point lights without cast shadows. The sub-pixel grid is the one of the
-noise-free reference (:mod:`btfref.render.reference`): n × n regular samples a pixel, box filter. Each sample
+Direct light of directional and point lights without cast shadows, and light from an environment where the method has
+a prefiltered path (:mod:`btfref.render.image_light`); the environment itself is not drawn. The sub-pixel grid is the
+one of the noise-free reference (:mod:`btfref.render.reference`): n × n regular samples a pixel, box filter. Each sample
 is one frame with a shifted projection; frames are added in float64.
 """
 
@@ -11,14 +12,17 @@ import time
 
 import numpy as np
 
-from btfref.errors import InputError
+from btfref import representations
+from btfref.demand import scene_views
+from btfref.errors import BtfrefError, InputError
+from btfref.registry import image_light
 from btfref.render import gl
 from btfref.render.result import RenderResult
 from btfref.render.scene import SceneDescription, read_scene
 from btfref.render.shapes import neighbours
 
 
-def realtime(scene, *, parameters=None, grid=4, size=None):
+def realtime(scene, *, parameters=None, grid=4, size=None, views="all"):
     """Render a scene with OpenGL.
 
     Parameters
@@ -30,27 +34,42 @@ def realtime(scene, *, parameters=None, grid=4, size=None):
         n of the n × n sub-pixel samples, at (i + ½)/n.
     size : (int, int), optional
         Width and height in place of the scene's.
+    views : {"all", "needed"}
+        "needed" keeps only the maps of those measured views in memory that the camera can see; the picture is the
+        same. Asks Mitsuba for the camera's rays; not for a `SceneDescription`.
 
     Returns
     -------
     RenderResult
         ``meta["frame_ms"]`` is the median time of one frame (one sample a pixel), GPU timer and wall clock
         whichever is longer; ``gl_vendor``, ``gl_renderer``, ``gl_version``; ``negative_fraction``, the share
-        of channels below zero, and ``not_finite``, their number: nothing is clamped.
+        of channels below zero, and ``not_finite``, their number: nothing is clamped; ``resident_views``, the number
+        of views kept by file.
 
     Raises
     ------
     InputError
-        For a scene that cannot be read (see :func:`btfref.render.scene.read_scene`), without lights, or with
-        a shape that has no BTF.
+        For a scene that cannot be read (see :func:`btfref.render.scene.read_scene`), without lights, with a shape
+        that has no BTF, or with an environment and a method without a prefiltered path.
     MissingDependencyError
         Without an OpenGL driver.
     """
     if grid < 1:
         raise InputError("the sub-pixel grid needs a sample", field="grid", got=grid, expected="≥ 1")
+    if views not in ("all", "needed"):
+        raise InputError("unknown choice of views", field="views", got=views, expected="all or needed")
+    needed = None
+    if views == "needed":
+        if isinstance(scene, SceneDescription):
+            raise InputError("the views that are needed follow from a scene file", field="views", got=views)
+        needed = scene_views(scene, parameters=parameters, grid=grid, size=size)
     if not isinstance(scene, SceneDescription):
         scene = read_scene(scene, parameters, size=size)
-    with Renderer(scene) as renderer:
+
+    def load_needed(path):
+        return representations.load(path, views=needed[path])
+
+    with Renderer(scene, load_needed if needed else None) as renderer:
         offsets = [((i + 0.5) / grid, (j + 0.5) / grid) for j in range(grid) for i in range(grid)]
         total = np.zeros((scene.camera.height, scene.camera.width, 3))
         times = []
@@ -67,8 +86,15 @@ def realtime(scene, *, parameters=None, grid=4, size=None):
             "not_finite": int((~np.isfinite(image)).sum()),
             "triangles": sum(len(mesh.faces) for mesh in scene.meshes),
             "lights": len(scene.lights),
+            "environment": scene.environment.name if scene.environment else None,
+            "resident_views": {name: len(kept) for name, kept in needed.items()} if needed else None,
             **gl.facts(renderer.ctx),
         }
+    if needed and meta["not_finite"]:
+        # Views that are not there give no number: such a picture is not handed out.
+        raise BtfrefError(
+            f"{meta['not_finite']} channels needed views that were not kept; render with all views"
+        )
     return RenderResult(image, None, meta)
 
 
@@ -78,12 +104,12 @@ class Renderer:
     Parameters
     ----------
     scene : SceneDescription
-    load : callable, optional
+    load_file : callable, optional
         ``path -> Representation``; the default reads the files.
     """
 
-    def __init__(self, scene, load=None):
-        if not scene.lights:
+    def __init__(self, scene, load_file=None):
+        if not scene.lights and scene.environment is None:
             raise InputError("the scene has no light", file=scene.source, field="emitter")
         for mesh in scene.meshes:
             if mesh.material is None:
@@ -91,8 +117,6 @@ class Renderer:
                 raise InputError(
                     "real-time rendering needs a btf material", file=where, field="bsdf", got=mesh.bsdf
                 )
-        if load is None:
-            from btfref.representations import load
         self.ctx = gl.context()
         self.camera = scene.camera
         self._owned, self._shown, self._meshes = [], {}, []
@@ -108,10 +132,11 @@ class Renderer:
         colour = self._own(self.ctx.texture(size, 4, dtype="f4"))
         self._target = self._own(self.ctx.framebuffer([colour], self._own(self.ctx.depth_renderbuffer(size))))
         self._near, self._far = _clip(self.camera, scene.meshes)
-        self._lights = _light_uniforms(scene.lights)
+        self._lights = _light_uniforms(scene.lights) if scene.lights else {}
+        self._n_lights, self._environment = len(scene.lights), scene.environment
         try:
             for mesh in scene.meshes:
-                self._add(mesh, load)
+                self._add(mesh, load_file or representations.load)
         except BaseException:
             self.release()
             raise
@@ -126,14 +151,18 @@ class Renderer:
         self._owned.append(thing)
         return thing
 
-    def _add(self, mesh, load):
+    def _add(self, mesh, load_file):
         material = mesh.material
         key = (material.filename, material.filter_type)
         if key not in self._shown:
+            rep = load_file(material.filename)
+            if self._environment is not None:
+                # The file's name belongs to the message that the method cannot do this.
+                image_light(rep.meta["method"], file=material.filename)
             shown = gl.ShaderRepresentation.upload(
-                self.ctx, load(material.filename), filter_type=material.filter_type
+                self.ctx, rep, filter_type=material.filter_type, environment=self._environment
             )
-            defines = {"N_LIGHTS": len(self._lights["light_power"])}
+            defines = {"N_LIGHTS": self._n_lights}
             program = shown.program(self.ctx, "hosts/mesh.vert", "hosts/mesh.frag", defines=defines)
             self._own(program), self._own(shown)
             self._shown[key] = shown, program, self._own(self.ctx.vertex_array(program, []))

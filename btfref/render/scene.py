@@ -10,6 +10,7 @@ import numpy as np
 from btfref.errors import InputError, MissingDependencyError
 from btfref.platform import prepare_llvm
 from btfref.render import parsing
+from btfref.render.environment import Environment, from_emitter
 from btfref.render.shapes import BtfMaterial, MeshDescription, triangles_of
 
 __all__ = ["BtfMaterial", "Camera", "Light", "MeshDescription", "SceneDescription", "read_scene"]
@@ -18,6 +19,9 @@ __all__ = ["BtfMaterial", "Camera", "Light", "MeshDescription", "SceneDescriptio
 VARIANT = "scalar_rgb"
 
 LIGHTS = ("directional", "point")
+
+#: Emitters infinitely far away on all sides; a scene has one at most.
+ENVIRONMENTS = ("envmap", "constant")
 
 
 @dataclass(frozen=True)
@@ -102,12 +106,14 @@ class SceneDescription:
     lights : tuple of Light
     source : str
         The scene file, for messages.
+    environment : btfref.render.environment.Environment or None
     """
 
     camera: Camera
     meshes: tuple[MeshDescription, ...]
     lights: tuple[Light, ...]
     source: str
+    environment: Environment | None = None
 
 
 def read_scene(scene, parameters=None, *, size=None):
@@ -157,10 +163,15 @@ def read_scene(scene, parameters=None, *, size=None):
             data = triangles_of(shape, node, file=parsed.location(node))
             name, plugin = shape.id(), node.props.plugin_name()
             meshes.append(MeshDescription(name=name, plugin=plugin, bsdf=bsdf, material=material, **data))
-        lights = [
-            _light(n.props.plugin_name(), e) for n, e in zip(nodes["Emitter"], made.emitters(), strict=True)
-        ]
-        return SceneDescription(_camera(made.sensors()[0]), tuple(meshes), tuple(lights), parsed.source)
+        lights, environment = [], None
+        for node, emitter in zip(nodes["Emitter"], made.emitters(), strict=True):
+            kind = node.props.plugin_name()
+            if kind in ENVIRONMENTS:
+                environment = from_emitter(kind, emitter, file=parsed.location(node))
+            else:
+                lights.append(_light(kind, emitter))
+        camera = _camera(made.sensors()[0])
+        return SceneDescription(camera, tuple(meshes), tuple(lights), parsed.source, environment)
     finally:
         if before is not None:
             parsing.use_variant(before)
@@ -185,11 +196,10 @@ def _check(parsed, nodes):
             if parsing.is_kind(film, "Film") and key in film.props:
                 raise InputError("cropped films are not supported", file=parsed.location(film), field=key)
     for node in nodes["Emitter"]:
-        if node.props.plugin_name() not in LIGHTS:
+        if node.props.plugin_name() not in LIGHTS + ENVIRONMENTS:
             where, got = parsed.location(node), node.props.plugin_name()
-            raise InputError(
-                "unsupported light", file=where, field="emitter", got=got, expected=" or ".join(LIGHTS)
-            )
+            expected = " or ".join(LIGHTS + ENVIRONMENTS)
+            raise InputError("unsupported light", file=where, field="emitter", got=got, expected=expected)
     for node in nodes["Shape"]:
         for _, child in parsed.children(node):
             if parsing.is_kind(child, "Emitter"):

@@ -18,6 +18,7 @@ import numpy as np
 from btfref.conventions import SCHEMA_VERSION
 from btfref.errors import InputError
 from btfref.registry import method
+from btfref.representations.resident import axes_of, select_views
 
 ATTRIBUTE = "btfref"
 MAXIMUM_WIDTH = 8192
@@ -95,12 +96,14 @@ def save(representation, path):
         raise
 
 
-def load(path):
+def load(path, *, views=None):
     """Read a representation.
 
     Parameters
     ----------
     path : path-like
+    views : array_like of int, optional
+        Keep the maps of these views only; see :mod:`btfref.representations.resident`.
 
     Returns
     -------
@@ -110,7 +113,7 @@ def load(path):
     ------
     InputError
         When the file is missing, empty, not an OpenEXR file, truncated, written by a newer schema, of an unknown
-        method, or holds a value that is not finite.
+        method, or holds a value that is not finite; when ``views`` cannot be chosen.
     """
     manifest, parts = _open(path, header_only=False)
     arrays = {}
@@ -119,7 +122,10 @@ def load(path):
             raise InputError("a map is missing", file=path, field=name)
         arrays[name] = _read_map(path, name, entry, parts[name])
     meta = manifest["meta"]
-    return method(meta["method"], file=path).representation.from_arrays(arrays, meta)
+    kind = method(meta["method"], file=path).representation
+    if views is not None:
+        arrays, meta = select_views(arrays, meta, axes_of(kind, meta["method"], file=path), views, file=path)
+    return kind.from_arrays(arrays, meta)
 
 
 def read_info(path):

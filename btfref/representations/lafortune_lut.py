@@ -7,6 +7,8 @@ shows of itself to a view (self-occlusion); Meseth, Müller, Klein 2004, Table 1
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from btfref.representations import analytic, lafortune
@@ -21,6 +23,9 @@ FACTOR_BOUND = 8.0
 
 class Representation(analytic.AnalyticMaps):
     """Maps of :class:`btfref.representations.lafortune.Representation` and ``factor`` [row, column, view]."""
+
+    #: Maps by view; see :mod:`btfref.representations.resident`.
+    VIEW_AXES: ClassVar = {"factor": 2}
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored. Never negative.

@@ -12,6 +12,8 @@ to a power.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from btfref.numerics.levenberg import fit_batch
@@ -50,6 +52,9 @@ class Representation(analytic.AnalyticMaps):
     """``lobes`` [row, column, view, 4 k]: parabolic axis (s, t), exponent, peak of each; ``colour`` [row, column, 4]:
     chroma and diffuse albedo ρ_d in 1/sr; and the direction tables.
     """  # noqa: D205
+
+    #: Maps by view; see :mod:`btfref.representations.resident`.
+    VIEW_AXES: ClassVar = {"lobes": 2}
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored. Never negative."""

@@ -11,6 +11,8 @@ l_z²``, so the functions are the same, but at grazing light, where they are sma
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from btfref.representations import analytic
@@ -32,6 +34,9 @@ def terms(w_light):
 
 class Representation(analytic.AnalyticMaps):
     """``polynomial`` [row, column, view, 6], ``chroma`` [row, column, 3], and the direction tables."""
+
+    #: Maps by view; see :mod:`btfref.representations.resident`.
+    VIEW_AXES: ClassVar = {"polynomial": 2}
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored.

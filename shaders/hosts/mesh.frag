@@ -1,4 +1,4 @@
-// Provides the radiance towards the camera under directional and point lights, without cast shadows.
+// Provides the radiance towards the camera under directional and point lights and an environment, without cast shadows.
 // Expects a representation, the tables of hosts/mesh.vert, the camera's rays, the lights and the material.
 
 #include "lib/frame.glsl"
@@ -35,6 +35,7 @@ void main() {
     float side = two_sided && w_view.z < 0.0 ? -1.0 : 1.0;
     w_view.z *= side;
     vec3 sum = vec3(0.0);
+#if N_LIGHTS > 0
     for (int i = 0; i < N_LIGHTS; ++i) {
         vec3 towards;
         vec3 irradiance = light_incident(i, point.position, towards);
@@ -43,5 +44,11 @@ void main() {
         // B holds the cosine of the light (design: conventions), nothing else is multiplied.
         sum += irradiance * btf_eval(uv, w_light, w_view, 0.0);
     }
+#endif
+#ifdef HAS_ENVIRONMENT
+    mat3 to_world = transpose(to_local);
+    to_world[2] *= side;
+    sum += btf_environment(uv, w_view, to_world);
+#endif
     radiance = vec4(scale * sum, 1.0);
 }

@@ -1,5 +1,5 @@
 // Provides view_stencil and light_stencil: neighbours of a direction among the measured ones; directions_valid.
-// Expects the samplers view_rings or view_triangles and view_cells, the same for light_, and light_directions.
+// Expects the samplers view_rings or view_triangles and view_cells, the same for light_, and light_directions; view_slots.
 
 #include "lib/rings.glsl"
 #include "lib/triangles.glsl"
@@ -9,6 +9,10 @@ uniform sampler2DArray view_rings;
 #else
 uniform sampler2DArray view_triangles;
 uniform sampler2DArray view_cells;
+#endif
+
+#ifdef VIEW_SLOTS_DIM0
+uniform usampler2DArray view_slots;  // place of each view in the maps, of which only some are kept
 #endif
 
 #ifdef LIGHT_RINGS_DIM0
@@ -26,10 +30,20 @@ bool directions_valid(vec3 w_light, vec3 w_view) {
 
 Stencil view_stencil(vec3 w) {
 #ifdef VIEW_RINGS_DIM0
-    return ring_stencil(view_rings, VIEW_RINGS_DIM0, w);
+    Stencil s = ring_stencil(view_rings, VIEW_RINGS_DIM0, w);
 #else
-    return triangle_stencil(view_triangles, VIEW_TRIANGLES_DIM0, view_cells, VIEW_CELLS_DIM0, w, false);
+    Stencil s = triangle_stencil(view_triangles, VIEW_TRIANGLES_DIM0, view_cells, VIEW_CELLS_DIM0, w, false);
 #endif
+#ifdef VIEW_SLOTS_DIM0
+    for (int i = 0; i < 4; ++i) {
+        uint slot = table_fetch(view_slots, s.index[i]).r;
+        // 0xffffffff: not kept. A weight that is no number shows in the picture, and is counted there.
+        bool absent = slot == 0xffffffffu;
+        s.index[i] = absent ? 0 : int(slot);
+        s.weight[i] = absent && s.weight[i] > 0.0 ? uintBitsToFloat(0x7fc00000u) : s.weight[i];
+    }
+#endif
+    return s;
 }
 
 // Below the outermost samples the weights sum to cos(theta)/cos(theta_last), so that B falls to zero at the horizon.

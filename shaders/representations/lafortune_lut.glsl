@@ -8,6 +8,16 @@
 
 uniform sampler2DArray factor;
 
+// Daubert et al. 2001: the factor stands for self-occlusion.
+float view_factor(int texel, Stencil views) {
+    float sum = 0.0;
+    for (int v = 0; v < 4; ++v) {
+        int at = texel * FACTOR_STRIDE + (views.index[v] >> 2);
+        sum += views.weight[v] * table_fetch(factor, at)[views.index[v] & 3];
+    }
+    return sum;
+}
+
 vec3 btf_eval(vec2 uv, vec3 w_light, vec3 w_view, float lod) {
     if (!directions_valid(w_light, w_view)) {
         return vec3(0.0);
@@ -22,12 +32,7 @@ vec3 btf_eval(vec2 uv, vec3 w_light, vec3 w_view, float lod) {
         if (texels.weight[x] == 0.0) {
             continue;
         }
-        // Daubert et al. 2001: the factor stands for self-occlusion.
-        float visible = 0.0;
-        for (int v = 0; v < 4; ++v) {
-            int at = texels.index[x] * FACTOR_STRIDE + (views.index[v] >> 2);
-            visible += views.weight[v] * table_fetch(factor, at)[views.index[v] & 3];
-        }
+        float visible = view_factor(texels.index[x], views);
         vec4 own = table_fetch(colour, texels.index[x] * COLOUR_STRIDE);
         sum += texels.weight[x] * visible * lafortune_value(texels.index[x], own.a, product) * own.rgb;
     }

@@ -1,0 +1,209 @@
+"""Image-based light of the methods that store functions of the light: tables for shaders, and the same in float64.
+
+Source: Meseth, Müller, Klein 2004, section 5.2. Differs from it in the foreshortening: their lobes multiply (n · l),
+approximated by (n · t); ours hold it. What lies below the local horizon, which a lobe over the sphere sees and the BTF
+does not, is taken out by a share that is exact in a constant environment.
+
+A class a method, found by the registry: ``SHADER`` provides ``btf_environment``, ``tables`` what it reads, and
+``radiance`` the same in float64, from the same tables.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from btfref import conventions
+from btfref.numerics import interpolation
+from btfref.numerics.powers import FLOOR, safe_power
+from btfref.render import prefilter
+from btfref.representations.analytic import held
+from btfref.representations.lafortune import flat_maps
+from btfref.representations.lookup import CHUNK
+from btfref.representations.rf_lobes import parabolic_axis
+
+
+class _PrefilteredLobes:
+    """What the methods share whose lobes look into prefiltered maps."""
+
+    #: Whether a lobe multiplies the light's cosine.
+    cosine = False
+
+    @classmethod
+    def tables(
+        cls, representation, environment, *, size=prefilter.SIZE, slices=prefilter.SLICES, horizon=True
+    ):
+        """Maps of the environment.
+
+        Parameters
+        ----------
+        representation : Representation
+        environment : btfref.render.environment.Environment
+        size : int
+            Texels a side of a parabolic map.
+        slices : int
+            Sampled exponents 2^(i/2), at least 2.
+        horizon : bool
+            False leaves lobes whole, below the horizon as well.
+
+        Returns
+        -------
+        dict of str to ndarray of float32
+            ``environment_maps`` [2 slices, size, size, 3], ``horizon_shares`` [slices, heights, 1].
+        """
+        edge = representation.meta["constants"]["light_edge"]
+        shares = prefilter.horizon_shares(edge, cosine=cls.cosine, slices=slices)
+        return {
+            "environment_maps": prefilter.lobe_maps(environment, size=size, slices=slices),
+            "horizon_shares": (shares if horizon else np.ones_like(shares))[..., None],
+        }
+
+
+class Lobes(_PrefilteredLobes):
+    """``rf_lobes``: ``ρ_d D(n) + Σ peak S(axis, n)`` by view."""
+
+    SHADER = "environment/rf_lobes.glsl"
+
+    @classmethod
+    def radiance(cls, representation, tables, uv, w_view, to_world):
+        """See :func:`radiance`."""
+        lobes = representation.maps["lobes"]
+        lobes = lobes.reshape(-1, lobes.shape[2], lobes.shape[3] // 4, 4)
+        colour = representation.maps["colour"].reshape(-1, 4).astype(float)
+        maps, shares = tables["environment_maps"], tables["horizon_shares"][..., 0]
+
+        def kernel(texel, view, w_view, frame):
+            at = lobes[texel[0][:, :, None], view[0][:, None, :]].astype(float)
+            s, t, exponent, peak = np.moveaxis(at, -1, 0)
+            axis = parabolic_axis(s, t)
+            world = np.einsum("nij,ntvkj->ntvki", frame, axis)
+            lobe = prefilter.lobe_lookup(maps, shares, world, axis[..., 2], np.maximum(exponent, 1))
+            value = np.einsum("ntvk,ntvkc,nv->ntc", peak, lobe, view[1])
+            value += colour[texel[0]][..., 3:] * _irradiance(maps, frame)[:, None]
+            return np.einsum("nt,ntc,ntc->nc", texel[1], value, colour[texel[0]][..., :3])
+
+        return _evaluated(representation, kernel, uv, w_view, to_world)
+
+
+class Lafortune(_PrefilteredLobes):
+    """``lafortune``: for a view, lobes along ``C v`` times the light's cosine, which the share holds."""
+
+    SHADER = "environment/lafortune.glsl"
+    cosine = True
+
+    @classmethod
+    def radiance(cls, representation, tables, uv, w_view, to_world):
+        """See :func:`radiance`."""
+        flat = flat_maps(representation.maps)
+        maps, shares = tables["environment_maps"], tables["horizon_shares"][..., 0]
+        edge = representation.meta["constants"]["view_edge"]
+
+        def kernel(texel, view, w_view, frame):
+            lobes = flat["lobes"][texel[0]]
+            t = lobes[..., :3] * held(w_view, edge)[0][:, None, None]
+            size, exponent = np.linalg.norm(t, axis=-1), lobes[..., 3]
+            axis = t / np.maximum(size, FLOOR)[..., None]
+            world = np.einsum("nij,ntkj->ntki", frame, axis)
+            lobe = prefilter.lobe_lookup(maps, shares, world, axis[..., 2], np.maximum(exponent, 1))
+            value = np.einsum("ntk,ntkc->ntc", flat["peaks"][texel[0]] * safe_power(size, exponent), lobe)
+            value += flat["colour"][texel[0]][..., 3:] * _irradiance(maps, frame)[:, None]
+            if "factor" in flat:
+                factor = flat["factor"][texel[0][:, :, None], view[0][:, None, :]]
+                value *= np.einsum("ntv,nv->nt", factor, view[1])[..., None]
+            return np.einsum("nt,ntc,ntc->nc", texel[1], value, flat["colour"][texel[0]][..., :3])
+
+        return _evaluated(representation, kernel, uv, w_view, to_world)
+
+
+class LafortuneTable(Lafortune):
+    """``lafortune_lut``: the same times the factor of the view."""
+
+    SHADER = "environment/lafortune_lut.glsl"
+
+
+class Polynomials:
+    """``rf_poly``: coefficients times the environment's moments about the normal; exact but for the map's texels."""
+
+    SHADER = "environment/rf_poly.glsl"
+
+    @classmethod
+    def tables(cls, representation, environment, *, size=prefilter.SIZE):
+        """``environment_moments`` [18, size, size, 3]; see :func:`prefilter.moment_maps`."""
+        edge = representation.meta["constants"]["light_edge"]
+        return {"environment_moments": prefilter.moment_maps(environment, edge, size=size)}
+
+    @classmethod
+    def radiance(cls, representation, tables, uv, w_view, to_world):
+        """See :func:`radiance`."""
+        polynomial = representation.maps["polynomial"]
+        polynomial = polynomial.reshape(-1, *polynomial.shape[2:])
+        chroma = representation.maps["chroma"].reshape(-1, 3).astype(float)
+        maps = tables["environment_moments"]
+
+        def kernel(texel, view, w_view, frame):
+            xx, yy, zz, xy, xz, yz, x, y, z = (
+                prefilter.map_lookup(maps, np.full(len(frame), i), frame[:, :, 2]) for i in range(9)
+            )
+            rows = [np.stack(row, 1) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))]
+            second, first = np.stack(rows, 1), np.stack([x, y, z], 1)
+            s, t, n = np.moveaxis(frame, 2, 0)
+            both = lambda a, b: np.einsum("ni,nijc,nj->nc", a, second, b)  # noqa: E731
+            one = lambda a: np.einsum("ni,nic->nc", a, first)  # noqa: E731
+            moments = np.stack([both(s, s), both(t, t), both(s, t), one(s), one(t), both(n, n)], 1)
+            at = polynomial[texel[0][:, :, None], view[0][:, None, :]].astype(float)
+            coefficient = np.einsum("ntvk,nv->ntk", at, view[1])
+            value = np.einsum("ntk,nkc->ntc", coefficient, moments)
+            return np.einsum("nt,ntc,ntc->nc", texel[1], value, chroma[texel[0]])
+
+        return _evaluated(representation, kernel, uv, w_view, to_world)
+
+
+def radiance(representation, tables, uv, w_view, to_world):
+    """Radiance towards the viewer under the environment that ``tables`` hold.
+
+    Parameters
+    ----------
+    representation : Representation
+        Of a method with a prefiltered path.
+    tables : dict of str to ndarray
+        From the method's class.
+    uv : array_like, shape (N, 2)
+    w_view : array_like, shape (N, 3)
+        Local frame.
+    to_world : array_like, shape (N, 3, 3)
+        Columns: the local axes x, y, z in world space.
+
+    Returns
+    -------
+    ndarray of float64, shape (N, 3)
+        In W/(m² sr); 0 for views below the horizon.
+
+    Raises
+    ------
+    InputError
+        For a method without a prefiltered path.
+    """
+    from btfref.registry import image_light
+
+    return image_light(representation.meta["method"]).radiance(representation, tables, uv, w_view, to_world)
+
+
+def _irradiance(maps, frame):
+    """The first slice is the cosine."""
+    return np.pi * prefilter.map_lookup(maps, np.zeros(len(frame), int), frame[:, :, 2])
+
+
+def _evaluated(representation, kernel, uv, w_view, to_world):
+    """Stencils, validity and bounded memory around a method's kernel."""
+    meta = representation.meta
+    views = interpolation.from_arrays(representation.arrays(), "view")
+    uv, w_view, to_world = (np.asarray(a, float) for a in (uv, w_view, to_world))
+    result = np.zeros((len(uv), 3))
+    step = CHUNK // 16
+    for first in range(0, len(uv), step):
+        part = slice(first, first + step)
+        valid = first + np.flatnonzero(conventions.valid_directions(w_view[part]))
+        if len(valid):
+            texel = conventions.texel_stencil(uv[valid], meta["texels"], meta["filter_type"])
+            view = views.stencil(w_view[valid])
+            result[valid] = kernel(texel, view, w_view[valid], to_world[valid])
+    return result

@@ -1,0 +1,229 @@
+"""Prefiltered environments: what a lobe, or a polynomial, of the light sees of an environment in any direction.
+
+Sources: Meseth, Müller, Klein 2004, section 5.2; J. Kautz, M. McCool, "Approximation of Glossy Reflection with
+Prefiltered Environment Maps", GI 2000; maps after W. Heidrich, H.-P. Seidel, "Realistic, Hardware-Accelerated Shading
+and Lighting", SIGGRAPH 1999.
+
+A map over the sphere is a pair of parabolic maps, the second one of the mirrored lower hemisphere. Texels outside the
+unit disc hold the other hemisphere's directions there, so that bilinear lookups are continuous across the seam.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from btfref.numerics.parabolic import bilinear_stencil, square_to_hemisphere, texel_centres
+from btfref.numerics.powers import FLOOR
+
+#: Sampled exponents of the paper: 2^(i/2), i = 0 … 10.
+SLICES = 11
+
+#: Texels a side of a parabolic map: 3.6 degrees at the pole, where the narrowest lobe, cos³², is 24 degrees wide.
+SIZE = 64
+
+#: Directions filtered at a time: their products with the cells stay in the cache.
+BLOCK = 64
+
+#: Values of the axis' height above the horizon, from −1 to 1, in a table of horizon shares.
+HEIGHTS = 128
+
+
+def exponents(slices=SLICES):
+    """The sampled exponents ``2^(i/2)``, shape (slices,)."""
+    return 2.0 ** (np.arange(slices) / 2)
+
+
+def map_directions(size=SIZE):
+    """Directions of the texels of a map over the sphere, shape (2, size, size, 3)."""
+    upper = square_to_hemisphere(texel_centres(size))
+    return np.stack([upper, upper * [1, 1, -1]])
+
+
+def lobe_maps(environment, *, size=SIZE, slices=SLICES):
+    """The environment as cosine lobes see it.
+
+    Parameters
+    ----------
+    environment : btfref.render.environment.Environment
+    size : int
+        Texels a side.
+    slices : int
+        Sampled exponents.
+
+    Returns
+    -------
+    ndarray of float32, shape (2 slices, size, size, 3)
+        For each exponent n, upper then lower hemisphere: the mean of the radiance with the weight ``max(a · l, 0)^n``,
+        so that the lobe's integral is this times ``2π / (n + 1)``. The first one times π is the irradiance of a
+        surface with normal a.
+    """
+    w, power = environment.cells()
+    lit = power.any(1)
+    w, power = w[lit].T.astype(np.float32), power[lit].astype(np.float32)
+    axis = map_directions(size).reshape(-1, 3).astype(np.float32)
+    result = np.zeros((slices, len(axis), 3), np.float32)
+    for first in range(0, len(axis), BLOCK):
+        part = slice(first, first + BLOCK)
+        cosine = np.maximum(axis[part] @ w, 0)
+        # Every second exponent is twice the one before: squares, and one power for each parity. They run down to
+        # numbers that are nothing.
+        with np.errstate(under="ignore"):
+            chain = [cosine, cosine ** np.float32(np.sqrt(2))]
+            for i in range(slices):
+                result[i, part] = chain[i % 2] @ power
+                if i + 2 < slices:
+                    np.multiply(chain[i % 2], chain[i % 2], out=chain[i % 2])
+                    # Subnormal numbers are slow and count for nothing.
+                    chain[i % 2][chain[i % 2] < 1e-18] = 0
+    result *= ((exponents(slices) + 1) / (2 * np.pi))[:, None, None].astype(np.float32)
+    return result.reshape(2 * slices, size, size, 3)
+
+
+def moment_maps(environment, edge, *, size=SIZE):
+    """Moments of the light over the hemisphere about any normal, as a polynomial of the light needs them.
+
+    Lights are held at the outermost measured cosine and fade below it, about that normal: see
+    :func:`btfref.representations.analytic.held`.
+
+    Parameters
+    ----------
+    environment : btfref.render.environment.Environment
+    edge : float
+        Smallest measured cosine; 0 holds nothing.
+    size : int
+
+    Returns
+    -------
+    ndarray of float32, shape (18, size, size, 3)
+        Upper and lower hemisphere of ``∫ fade m(l') L dω`` for m = x², y², z², xy, xz, yz, x, y, z of the held light l'
+        in world space.
+    """
+    w, power = environment.cells()
+    lit = power.any(1)
+    w, power = w[lit], power[lit]
+    x, y, z = w.T
+    # What multiplies the squares, the products with the normal, and the normal's own part of a held direction.
+    square = np.stack([x * x, y * y, z * z, x * y, x * z, y * z], 1)
+    features = [(m[:, :, None] * power[:, None]).reshape(len(w), -1) for m in (square, w)] + [power]
+    features = [f.astype(np.float32) for f in features]
+    normal = map_directions(size).reshape(-1, 3)
+    result = np.zeros((9, len(normal), 3))
+    radius = np.sqrt(max(1 - edge * edge, 0))
+    for first in range(0, len(normal), BLOCK):
+        part = slice(first, first + BLOCK)
+        n = normal[part]
+        height = (n.astype(np.float32) @ w.T.astype(np.float32)).astype(np.float32)
+        below = height < edge
+        # l' = α l + β n: unchanged above the edge; there the horizontal part grows to the ring's radius.
+        horizontal = np.sqrt(np.maximum(1 - height * height, 1e-12))
+        a = np.where(below, radius / horizontal, 1).astype(np.float32)
+        b = np.where(below, edge - a * height, 0).astype(np.float32)
+        fade = np.where(below, np.maximum(height, 0) / max(edge, 1e-30), 1).astype(np.float32)
+        aa, ab, bb = (
+            (fade * k).astype(np.float32) @ f for k, f in zip((a * a, a * b, b * b), features, strict=True)
+        )
+        va, vb = (fade * a) @ features[1], (fade * b) @ features[2]
+        aa, ab, va = aa.reshape(-1, 6, 3), ab.reshape(-1, 3, 3), va.reshape(-1, 3, 3)
+        for k, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))):
+            mixed = ab[:, i] * n[:, j, None] + ab[:, j] * n[:, i, None]
+            result[k, part] = aa[:, k] + mixed + bb * (n[:, i] * n[:, j])[:, None]
+        for k in range(3):
+            result[6 + k, part] = va[:, k] + vb * n[:, k, None]
+    return result.reshape(18, size, size, 3).astype(np.float32)
+
+
+def horizon_shares(edge, *, cosine, slices=SLICES, heights=HEIGHTS):
+    """What is left of a lobe above the horizon, where lights below it count for nothing and those near it fade.
+
+    Parameters
+    ----------
+    edge : float
+        Smallest measured cosine; see :func:`moment_maps`.
+    cosine : bool
+        Whether the lobe multiplies the light's cosine (Lafortune) or stands for itself (reflectance fields).
+    slices, heights : int
+
+    Returns
+    -------
+    ndarray of float32, shape (slices, heights)
+        By exponent and height ``a_z`` of the axis, from −1 to 1: the ratio of the lobe's integral over the hemisphere,
+        held and faded, to that over the sphere. With it, lobes are exact in a constant environment.
+    """
+    # Gauss–Legendre in the height on both sides of the edge, equal steps in the azimuth.
+    nodes, weights = np.polynomial.legendre.leggauss(48)
+    pieces = [(0.0, edge), (edge, 1.0)] if edge > 0 else [(0.0, 1.0)]
+    z = np.concatenate([low + (high - low) * (nodes + 1) / 2 for low, high in pieces])
+    weight = np.concatenate([(high - low) / 2 * weights for low, high in pieces])
+    phi = (np.arange(256) + 0.5) * (np.pi / 256)
+    held = np.maximum(z, edge)
+    radius = np.sqrt(1 - held * held)
+    fade = np.where(z < edge, z / max(edge, 1e-30), 1) * (held if cosine else 1)
+    a = np.linspace(-1, 1, heights)[:, None, None]
+    product = radius[:, None] * np.sqrt(1 - a * a) * np.cos(phi) + held[:, None] * a
+    log = np.log(np.maximum(product, FLOOR))
+    result = np.zeros((slices, heights))
+    for i, n in enumerate(exponents(slices)):
+        lobe = np.where(product > FLOOR, np.exp(n * log), 0).mean(-1)
+        result[i] = lobe @ (weight * fade) * (n + 1)
+    return result.astype(np.float32)
+
+
+def map_lookup(maps, index, w):
+    """Bilinear lookup in one of several maps over the sphere, as ``shaders/lib/environment.glsl`` does it.
+
+    Parameters
+    ----------
+    maps : ndarray, shape (2 k, size, size, channels)
+    index : ndarray of int, shape (...)
+        Which of the k maps.
+    w : ndarray, shape (..., 3)
+        Directions of any length.
+
+    Returns
+    -------
+    ndarray of float64, shape (..., channels)
+    """
+    size = maps.shape[1]
+    at, weight = bilinear_stencil(np.concatenate([w[..., :2], np.abs(w[..., 2:])], -1), size)
+    flat = maps.reshape(len(maps), size * size, -1)
+    half = 2 * np.asarray(index) + (w[..., 2] < 0)
+    return np.einsum("...k,...kc->...c", weight, flat[half[..., None], at].astype(float))
+
+
+def lobe_lookup(maps, shares, axis, height, exponent):
+    """Integral of ``max(a · l, 0)^n`` times the environment over the hemisphere of a surface.
+
+    Parameters
+    ----------
+    maps : ndarray, shape (2 slices, size, size, channels)
+        See :func:`lobe_maps`.
+    shares : ndarray, shape (slices, heights)
+        See :func:`horizon_shares`.
+    axis : ndarray, shape (..., 3)
+        World space, any length.
+    height : ndarray, shape (...)
+        Component of the unit axis along the surface's normal.
+    exponent : ndarray, shape (...)
+        Linear in its logarithm between the sampled ones; beyond the largest, that one's mean radiance is taken.
+
+    Returns
+    -------
+    ndarray of float64, shape (..., channels)
+    """
+    slices = len(maps) // 2
+    position = np.clip(2 * np.log2(np.maximum(exponent, 1)), 0, slices - 1)
+    low = np.minimum(position.astype(np.int64), slices - 2)
+    f = position - low
+    mean = (1 - f)[..., None] * map_lookup(maps, low, axis)
+    mean += f[..., None] * map_lookup(maps, low + 1, axis)
+    share = (1 - f) * share_lookup(shares, low, height) + f * share_lookup(shares, low + 1, height)
+    return (2 * np.pi / (exponent + 1) * share)[..., None] * mean
+
+
+def share_lookup(shares, index, height):
+    """Linear lookup in a row of a table of horizon shares."""
+    last = shares.shape[1] - 1
+    position = np.clip((height + 1) * (last / 2), 0, last)
+    low = np.minimum(position.astype(np.int64), last - 1)
+    f = position - low
+    return (1 - f) * shares[index, low].astype(float) + f * shares[index, low + 1].astype(float)

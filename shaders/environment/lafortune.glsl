@@ -1,0 +1,24 @@
+// Provides btf_environment of Lafortune lobes per texel: radiance under a prefiltered environment.
+// Expects what representations/lafortune.glsl and lib/environment.glsl expect.
+
+#include "representations/lafortune.glsl"
+#include "lib/lafortune_light.glsl"
+
+// to_world takes local directions to world space.
+vec3 btf_environment(vec2 uv, vec3 w_view, mat3 to_world) {
+    if (!directions_valid(w_view, w_view)) {
+        return vec3(0.0);
+    }
+    Stencil texels = texel_stencil(uv, COLOUR_DIM0, COLOUR_DIM1);
+    float unused;
+    vec3 view = held(w_view, VIEW_EDGE, unused);
+    vec3 sum = vec3(0.0);
+    for (int x = 0; x < 4; ++x) {
+        if (texels.weight[x] == 0.0) {
+            continue;
+        }
+        vec4 own = table_fetch(colour, texels.index[x] * COLOUR_STRIDE);
+        sum += texels.weight[x] * own.rgb * lafortune_light(texels.index[x], own.a, view, to_world);
+    }
+    return sum;
+}

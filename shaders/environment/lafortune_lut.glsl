@@ -1,0 +1,26 @@
+// Provides btf_environment of Lafortune lobes times a view-dependent factor: radiance under a prefiltered environment.
+// Expects what representations/lafortune_lut.glsl and lib/environment.glsl expect.
+
+#include "representations/lafortune_lut.glsl"
+#include "lib/lafortune_light.glsl"
+
+// to_world takes local directions to world space.
+vec3 btf_environment(vec2 uv, vec3 w_view, mat3 to_world) {
+    if (!directions_valid(w_view, w_view)) {
+        return vec3(0.0);
+    }
+    Stencil texels = texel_stencil(uv, COLOUR_DIM0, COLOUR_DIM1);
+    Stencil views = view_stencil(w_view);
+    float unused;
+    vec3 view = held(w_view, VIEW_EDGE, unused);
+    vec3 sum = vec3(0.0);
+    for (int x = 0; x < 4; ++x) {
+        if (texels.weight[x] == 0.0) {
+            continue;
+        }
+        vec4 own = table_fetch(colour, texels.index[x] * COLOUR_STRIDE);
+        float visible = view_factor(texels.index[x], views);
+        sum += texels.weight[x] * visible * own.rgb * lafortune_light(texels.index[x], own.a, view, to_world);
+    }
+    return sum;
+}

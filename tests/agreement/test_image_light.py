@@ -1,0 +1,222 @@
+"""Image-based light: GLSL against float64 (the implementation), and against the BSDF under the same environment."""
+
+import subprocess
+from importlib.resources import files
+
+import numpy as np
+import pytest
+from probes import hemisphere
+
+from btfref.cli import main
+from btfref.compare import compare, save_image
+from btfref.compare.comparison import agreement
+from btfref.compare.tolerances import tolerance
+from btfref.platform import shader_directory
+from btfref.registry import image_light, methods
+from btfref.render import composer, gl
+from btfref.render.classes import pixel_classes
+from btfref.render.environment import Environment, bright_texel, constant
+from btfref.render.image_light import radiance
+from btfref.render.probe import probe_environment
+from btfref.render.realtime import realtime
+from btfref.render.reference import film_rays, loaded, render
+from btfref.render.scene import read_scene
+
+KEYS = [key for key, row in methods().items() if row.image_light]
+SPHERE = files("btfref.scenes").joinpath("sphere.xml")
+SIZE = (48, 48)
+
+
+@pytest.fixture(autouse=True)
+def _gl(need):
+    need("gl")
+
+
+def smooth_sky():
+    """A bright, broad cloud above a horizon that is darker on one side; in z-up coordinates of the shipped scenes."""
+    v, u = np.meshgrid(np.arange(32) / 31, (np.arange(64) + 0.5) / 64, indexing="ij")
+    glow = np.exp(-12 * ((v - 0.3) ** 2 + (u - 0.4) ** 2))
+    ground = 0.2 + 0.1 * np.cos(2 * np.pi * u) + 0.5 * (v < 0.5)
+    return Environment(
+        (ground[..., None] * [0.5, 0.7, 1] + 3 * glow[..., None] * [1, 0.9, 0.7]).astype(np.float32)
+    )
+
+
+def lookups(rng, n=4000):
+    frame = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+    frame[:, :, 2] *= np.linalg.det(frame)[:, None]
+    return rng.uniform(-1, 2, (n, 2)).astype(np.float32), hemisphere(rng, n), frame.astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def tables():
+    """Environments by name, and each method's tables of each, made once and small."""
+    environments = {"sky": smooth_sky(), "light": bright_texel([0.3, -0.5, 0.8]), "constant": constant()}
+    made = {}
+
+    def get(key, rep, name):
+        kind = (getattr(image_light(key), "cosine", None), name)
+        if kind not in made:
+            made[kind] = image_light(key).tables(rep, environments[name], size=32)
+        return environments[name], made[kind]
+
+    return get
+
+
+@pytest.mark.parametrize("name", ["sky", "light"])
+@pytest.mark.parametrize("key", KEYS)
+def test_shader_agrees_with_float64(fits, tables, monkeypatch, rng, key, name):
+    rep = fits(key)
+    environment, own = tables(key, rep, name)
+    monkeypatch.setattr(image_light(key), "tables", classmethod(lambda *_: own))
+    points = lookups(rng)
+    found = agreement(
+        probe_environment(rep, environment, *points),
+        radiance(rep, own, *points),
+        gate="environment.agreement",
+    )
+    assert found.passed, [gate.line for gate in found.gates]
+    assert np.abs(radiance(rep, own, *points)).max() > 0
+
+
+FAULTS = {
+    "lower hemisphere not mirrored": ("w.z < 0.0 ? 1 : 0), size", "w.z < 0.0 ? 0 : 0), size"),
+    "exponents not interpolated": ("float f = position - float(low);", "float f = 0.0;"),
+    "horizon forgotten": ("(n + 1.0) * share)", "(n + 1.0))"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_injected_faults_are_caught(fits, tables, monkeypatch, rng, tmp_path, name):
+    right, wrong = FAULTS[name]
+    text = (shader_directory() / "lib/environment.glsl").read_text()
+    assert text.count(right) == 1
+    (tmp_path / "lib").mkdir()
+    (tmp_path / "lib/environment.glsl").write_text(text.replace(right, wrong))
+    rep = fits("rf_lobes")
+    environment, own = tables("rf_lobes", rep, "light")
+    monkeypatch.setattr(image_light("rf_lobes"), "tables", classmethod(lambda *_: own))
+    shipped = gl.shader_file(rep)
+    monkeypatch.setattr(gl, "shader_file", lambda rep: (shipped[0], [tmp_path, *shipped[1]]))
+    points = lookups(rng)
+    found = agreement(
+        probe_environment(rep, environment, *points),
+        radiance(rep, own, *points),
+        gate="environment.agreement",
+    )
+    assert not found.passed
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_a_constant_environment_is_the_albedo(fits, tables, rng, key):
+    """The share of a lobe above the horizon is exact there: the integral of B over the hemisphere comes out."""
+    from btfref.numerics.quadrature import gauss_hemisphere
+
+    rep = fits(key)
+    _, own = tables(key, rep, "constant")
+    uv, w_view, frame = (a[:24] for a in lookups(rng))
+    w, weight = gauss_hemisphere(96, 192)
+    expected = np.einsum("l,nlc->nc", weight, rep.evaluate(uv[:, None], w, w_view[:, None]))
+    difference = radiance(rep, own, uv, w_view, frame) - expected
+    assert np.abs(difference).max() <= tolerance("environment.albedo.max") * expected.max()
+
+
+def definition(path, parameters, own, rep):
+    """The picture that float64 gives for the rays of the camera, one a pixel; zero where nothing is hit."""
+    with loaded(path, parameters, size=SIZE) as scene:
+        ray, _ = film_rays(scene.sensors()[0], (0.5, 0.5))
+        si = scene.ray_intersect(ray)
+        hit = np.array(si.is_valid())
+        tiling = float(parameters["tiling"])
+        uv, w_view = np.array(si.uv).T * tiling, np.array(si.wi).T
+        axes = [np.array(axis).T for axis in (si.sh_frame.s, si.sh_frame.t, si.sh_frame.n)]
+    value = np.zeros((len(hit), 3))
+    value[hit] = radiance(rep, own, uv[hit], w_view[hit], np.stack(axes, 2)[hit])
+    return value.reshape(*SIZE[::-1], 3)
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_pictures_of_a_sphere(need, fits, tmp_path, key):
+    """Tight against float64 at the same rays; loose against the path tracer, whose noise must not decide."""
+    need("llvm")
+    save_image(tmp_path / "sky.exr", smooth_sky().radiance)
+    parameters = {"btf": str(fits.path(key)), "lights": "envmap", "environment": str(tmp_path / "sky.exr")}
+    parameters["tiling"] = "4"
+    classes = pixel_classes(SPHERE, parameters=parameters, grid=1, size=SIZE)
+    rep, scene = fits(key), read_scene(SPHERE, parameters, size=SIZE)
+    image = realtime(scene, grid=1)
+    assert image.meta["environment"] == "envmap"
+    assert (image.image[classes == 1].max(-1) > 0.01).all()
+    own = image_light(key).tables(rep, scene.environment)
+    exact = definition(SPHERE, parameters, own, rep)
+    found = compare(image, exact.astype(np.float32), classes=classes, gate="image.float64", flip=False)
+    assert found.passed, [gate.line for gate in found.gates]
+
+    image = realtime(scene, grid=4)
+    classes = pixel_classes(SPHERE, parameters=parameters, grid=4, size=SIZE)
+    inside = classes == 1
+    spp = 256
+    while True:
+        reference = render(SPHERE, parameters=parameters, spp=spp, seed=1, size=SIZE, with_variance=True)
+        noise = np.sqrt(reference.variance[inside].mean()) / reference.image[inside].mean()
+        limit = tolerance("reference.standard_error.max_fraction") * tolerance(
+            "image.environment.relative_rmse"
+        )
+        if noise <= limit:
+            break
+        spp = int(spp * max(2.0, 1.2 * (noise / limit) ** 2))
+        assert spp < 1 << 17
+    found = compare(image, reference, classes=classes, gate="image.environment", flip=False)
+    assert found.passed, [gate.line for gate in found.gates]
+
+
+def test_a_method_without_a_prefiltered_path_is_refused_in_one_line(fits, tmp_path, capsys):
+    arguments = ["realtime", "sphere", "-o", str(tmp_path / "x.exr"), "-D", "lights=constant"]
+    assert main([*arguments, "-D", f"btf={fits.path('lpca')}"]) == 2
+    error = capsys.readouterr().err.strip()
+    assert "prefiltered" in error
+    assert "rf_lobes" in error
+    assert len(error.splitlines()) == 1
+    assert not (tmp_path / "x.exr").exists()
+
+
+def test_lights_and_environment_add_up(need, fits, tmp_path, llvm):
+    """A sun and a constant sky in one scene give the sum of their pictures."""
+    llvm.set_variant("scalar_rgb")
+    look = llvm.ScalarTransform4f().look_at([0.5, -2, 2], [0, 0, 0], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 24, "height": 24}
+    camera = {"type": "perspective", "fov": 40, "to_world": look, "film": film}
+    bsdf = {"type": "twosided", "inside": {"type": "btf", "filename": str(fits.path("rf_lobes"))}}
+    below = llvm.ScalarTransform4f().rotate([1, 0, 0], 180)
+    plane = {"type": "rectangle", "bsdf": bsdf, "to_world": below}
+    sky = {"type": "constant", "radiance": 0.5}
+    sun = {"type": "directional", "direction": [-0.3, 0.6, -1.0]}
+    scenes = [
+        {"type": "scene", "camera": camera, "plane": plane, **lights}
+        for lights in ({"sky": sky}, {"sun": sun}, {"sky": sky, "sun": sun})
+    ]
+    first, second, both = (realtime(scene, grid=1).image for scene in scenes)
+    np.testing.assert_allclose(both, first + second, rtol=1e-5)
+    assert first.max() > 0
+    # Seen from behind through twosided, a constant sky looks as from the front of the mirrored plane.
+    assert (first.max(-1) > 0).any()
+
+
+@pytest.mark.parametrize("target", composer.TARGETS)
+@pytest.mark.parametrize("key", KEYS)
+def test_glslang_accepts_the_environment_shaders(need, fits, tmp_path, key, target):
+    validator = need("glslang")
+    rep, light = fits(key), image_light(key)
+    own = light.tables(rep, constant(), size=8)
+    shapes = {f"{n}_DIM{axis}".upper(): k for n, table in own.items() for axis, k in enumerate(table.shape)}
+    for host, n_lights in (
+        ("hosts/mesh.frag", 0),
+        ("hosts/mesh.frag", 2),
+        ("hosts/probe_environment.vert", 0),
+    ):
+        defines = {**gl.shader_defines(rep), **shapes, "HAS_ENVIRONMENT": True, "N_LIGHTS": n_lights}
+        source = composer.compose(host, defines, representation=light.SHADER, target=target)
+        path = tmp_path / host.replace("/", "_")
+        path.write_text(source, encoding="utf-8")
+        done = subprocess.run([validator, str(path)], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, source.explain(done.stdout)

@@ -1,0 +1,154 @@
+"""Environments: Mitsuba's conventions, what filters of them must give, and what is refused."""
+
+import numpy as np
+import pytest
+
+from btfref.compare.tolerances import tolerance
+from btfref.errors import InputError
+from btfref.numerics.quadrature import gauss_hemisphere
+from btfref.registry import image_light, methods
+from btfref.render import prefilter
+from btfref.render.environment import Environment, bright_texel, constant, from_emitter, sunsky
+
+SMALL = {"size": 32}
+
+
+def sphere(n_theta=200, n_phi=800):
+    """Directions over the whole sphere and solid angles."""
+    w, weight = gauss_hemisphere(n_theta, n_phi)
+    return np.concatenate([w, w * [1, 1, -1]]), np.concatenate([weight, weight])
+
+
+def random_directions(rng, n):
+    w = rng.normal(size=(n, 3))
+    return w / np.linalg.norm(w, axis=1, keepdims=True)
+
+
+def sky(rng, shape=(8, 16)):
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    return Environment(rng.uniform(0.2, 2, (*shape, 3)).astype(np.float32), turn)
+
+
+def test_it_reads_pictures_as_mitsuba_does(llvm, tmp_path, rng):
+    import drjit as dr
+
+    picture = rng.uniform(0, 1, (9, 14, 3)).astype(np.float32)
+    llvm.Bitmap(picture).write(str(tmp_path / "sky.exr"))
+    turn = llvm.ScalarTransform4f().rotate([0.6, 0, 0.8], 40)
+    emitter = llvm.load_dict(
+        {"type": "envmap", "filename": str(tmp_path / "sky.exr"), "scale": 2.0, "to_world": turn}
+    )
+    environment = from_emitter("envmap", emitter)
+    w = random_directions(rng, 20_000).astype(np.float32)
+    si = dr.zeros(llvm.SurfaceInteraction3f, len(w))
+    si.wi = -llvm.Vector3f(w.T)
+    difference = environment.evaluate(w) - np.array(emitter.eval(si)).T
+    assert np.abs(difference).max() <= tolerance("environment.mitsuba.max")
+
+
+def test_cells_hold_the_whole_environment(rng):
+    environment = sky(rng)
+    w, weight = sphere()
+    expected = weight @ environment.evaluate(w)
+    cells, power = environment.cells()
+    np.testing.assert_allclose(power.sum(0), expected, rtol=tolerance("environment.cells.relative"))
+    np.testing.assert_allclose(constant().cells()[1].sum(0), 4 * np.pi, rtol=1e-6)
+    # A single light is where it was put, within half a texel, with the power asked for.
+    direction = np.array([0.4, 0.3, 0.86]) / np.linalg.norm([0.4, 0.3, 0.86])
+    cells, power = bright_texel(direction, irradiance=3.0).cells()
+    np.testing.assert_allclose(power.sum(0), 3, rtol=1e-5)
+    centre = power[:, 0] @ cells
+    assert centre @ direction / np.linalg.norm(centre) > np.cos(np.pi / 63)
+
+
+def test_lobes_of_a_constant_environment_see_that_constant():
+    maps = prefilter.lobe_maps(constant([1.0, 2.0, 0.5]), **SMALL)
+    np.testing.assert_allclose(
+        maps, np.broadcast_to([1, 2, 0.5], maps.shape), rtol=tolerance("environment.filter.constant")
+    )
+
+
+def test_lobes_of_a_small_light_are_powers_of_cosines(rng):
+    light = np.array([0.36, 0.48, -0.8])
+    environment = bright_texel(light, shape=(512, 1024))
+    cells, power = environment.cells()
+    light = power[:, 0] @ cells
+    light /= np.linalg.norm(light)
+    maps = prefilter.lobe_maps(environment)
+    w = random_directions(rng, 4000)
+    for i, n in enumerate(prefilter.exponents()):
+        expected = np.maximum(w @ light, 0) ** n * (n + 1) / (2 * np.pi)
+        found = prefilter.map_lookup(maps, np.full(len(w), i), w)[:, 0]
+        assert np.abs(found - expected).max() <= tolerance("environment.filter.light") * expected.max()
+
+
+def test_lobes_of_a_sky_are_its_integrals(rng):
+    environment = sky(rng)
+    w, weight = sphere()
+    radiance = environment.evaluate(w) * weight[:, None]
+    maps = prefilter.lobe_maps(environment)
+    axis = random_directions(rng, 30)
+    for i in (0, 3, 10):
+        n = prefilter.exponents()[i]
+        expected = np.maximum(axis @ w.T, 0) ** n @ radiance * (n + 1) / (2 * np.pi)
+        found = prefilter.map_lookup(maps, np.full(len(axis), i), axis)
+        np.testing.assert_allclose(found, expected, rtol=tolerance("environment.filter.sky"))
+
+
+def test_moments_of_a_constant_environment(rng):
+    """Over a hemisphere about n: ∫ l l dω = 2π/3 I and ∫ l dω = π n."""
+    maps = prefilter.moment_maps(constant(), 0.0)
+    n = random_directions(rng, 500)
+    found = np.stack([prefilter.map_lookup(maps, np.full(len(n), i), n)[:, 0] for i in range(9)], 1)
+    limit = tolerance("environment.moments.max")
+    assert np.abs(found[:, :3] - 2 * np.pi / 3).max() <= limit * 2 * np.pi
+    assert np.abs(found[:, 3:6]).max() <= limit * 2 * np.pi
+    assert np.abs(found[:, 6:] - np.pi * n).max() <= limit * 2 * np.pi
+
+
+def test_shares_above_the_horizon():
+    n = prefilter.exponents()
+    for cosine, upright in ((False, np.ones_like(n)), (True, (n + 1) / (n + 2))):
+        shares = prefilter.horizon_shares(0.0, cosine=cosine)
+        assert np.abs(shares[:, -1] - upright).max() <= tolerance("environment.shares.max")
+        assert np.abs(shares[:, 0]).max() <= tolerance("environment.shares.max")
+        assert (np.diff(shares, axis=1) >= -tolerance("environment.shares.max")).all()
+    # Half of a lobe along the horizon is above it: heights are symmetric about 0.
+    half = prefilter.horizon_shares(0.0, cosine=False)
+    assert np.abs(half + half[:, ::-1] - 1).max() <= tolerance("environment.shares.max")
+
+
+def test_sun_and_sky(need):
+    need("llvm")
+    sun = np.array([0.4, 0.3, 0.86])
+    environment = sunsky(shape=(64, 128), sun_direction=sun)
+    cells, power = environment.cells()
+    brightest = cells[power.sum(1).argmax()]
+    assert brightest @ sun / np.linalg.norm(sun) > np.cos(np.radians(3))
+    assert (environment.evaluate([0, 0, 1]) > 0).all()
+    np.testing.assert_array_equal(environment.evaluate([0.1, 0.1, -0.9]), 0)
+
+
+@pytest.mark.parametrize(
+    ("radiance", "turn", "field"),
+    [
+        (np.ones((4, 8)), np.eye(3), "radiance"),
+        (np.full((4, 8, 3), -1.0), np.eye(3), "radiance"),
+        (np.full((4, 8, 3), np.nan), np.eye(3), "radiance"),
+        (np.ones((4, 8, 3)), 2 * np.eye(3), "to_world"),
+    ],
+)
+def test_what_is_no_environment(radiance, turn, field):
+    with pytest.raises(InputError) as caught:
+        Environment(radiance, turn)
+    assert caught.value.field == field
+
+
+def test_the_registry_knows_who_can():
+    having = {key for key, row in methods().items() if row.image_light}
+    assert having >= {"rf_poly", "rf_lobes", "lafortune", "lafortune_lut"}
+    for key in having:
+        assert image_light(key).SHADER
+    with pytest.raises(InputError, match="prefiltered") as caught:
+        image_light("raw", file="x.raw.exr")
+    assert "rf_lobes" in caught.value.expected
