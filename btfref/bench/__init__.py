@@ -4,6 +4,7 @@ from __future__ import annotations
 
 #: Suites by name: module with ``run(*, quick, progress, btf, only) -> dict`` and ``table(result) -> rows``.
 SUITES = {
+    "environment": "btfref.bench.environment",
     "factors": "btfref.bench.factors",
     "fit": "btfref.bench.fit",
     "lobes": "btfref.bench.lobes",
