@@ -4,8 +4,9 @@ Sources: Meseth, Müller, Klein 2004, section 5.2; J. Kautz, M. McCool, "Approxi
 Prefiltered Environment Maps", GI 2000; maps after W. Heidrich, H.-P. Seidel, "Realistic, Hardware-Accelerated Shading
 and Lighting", SIGGRAPH 1999.
 
-A map over the sphere is a pair of parabolic maps, the second one of the mirrored lower hemisphere. Texels outside the
-unit disc hold the other hemisphere's directions there, so that bilinear lookups are continuous across the seam.
+A map over the sphere is a pair of parabolic maps, the second one of the mirrored lower hemisphere. The unit disc fills
+all but half a texel of the square at its sides, and texels outside of it hold the other hemisphere's directions there,
+so that bilinear lookups are continuous across the seam.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def exponents(slices=SLICES):
 
 def map_directions(size=SIZE):
     """Directions of the texels of a map over the sphere, shape (2, size, size, 3)."""
-    upper = square_to_hemisphere(texel_centres(size))
+    upper = square_to_hemisphere(texel_centres(size) * (size / (size - 1)))
     return np.stack([upper, upper * [1, 1, -1]])
 
 
@@ -169,7 +170,7 @@ def horizon_shares(edge, *, cosine, slices=SLICES, heights=HEIGHTS):
 
 
 def map_lookup(maps, index, w):
-    """Bilinear lookup in one of several maps over the sphere, as ``shaders/lib/environment.glsl`` does it.
+    """Bilinear lookup in one of several maps over the sphere, as ``shaders/lib/sphere_maps.glsl`` does it.
 
     Parameters
     ----------
@@ -184,7 +185,9 @@ def map_lookup(maps, index, w):
     ndarray of float64, shape (..., channels)
     """
     size = maps.shape[1]
-    at, weight = bilinear_stencil(np.concatenate([w[..., :2], np.abs(w[..., 2:])], -1), size)
+    scale = np.linalg.norm(w, axis=-1) + np.abs(w[..., 2])
+    scale = (size - 1) / (size * np.where(scale > 0, scale, 1))
+    at, weight = bilinear_stencil(square_to_hemisphere(w[..., :2] * scale[..., None]), size)
     flat = maps.reshape(len(maps), size * size, -1)
     half = 2 * np.asarray(index) + (w[..., 2] < 0)
     return np.einsum("...k,...kc->...c", weight, flat[half[..., None], at].astype(float))

@@ -2,14 +2,9 @@
 // Expects what representations/rf_poly.glsl expects, and environment_moments [18, size, size, 3].
 
 #include "representations/rf_poly.glsl"
-#include "lib/parabolic_maps.glsl"
+#include "lib/sphere_maps.glsl"
 
 uniform sampler2DArray environment_moments;
-
-vec3 moment(int i, vec3 normal) {
-    Stencil s = parabolic_stencil(vec3(normal.xy, abs(normal.z)), ENVIRONMENT_MOMENTS_DIM1);
-    return parabolic_lookup(environment_moments, 2 * i + (normal.z < 0.0 ? 1 : 0), ENVIRONMENT_MOMENTS_DIM1, s);
-}
 
 // to_world takes local directions to world space.
 vec3 btf_environment(vec2 uv, vec3 w_view, mat3 to_world) {
@@ -20,7 +15,7 @@ vec3 btf_environment(vec2 uv, vec3 w_view, mat3 to_world) {
     // Moments x^2, y^2, z^2, xy, xz, yz, x, y, z in world space; those of the local frame are their contractions.
     vec3 m[9];
     for (int i = 0; i < 9; ++i) {
-        m[i] = moment(i, n);
+        m[i] = sphere_lookup(environment_moments, i, ENVIRONMENT_MOMENTS_DIM1, n);
     }
     vec3 xx = s.x * s.x * m[0] + s.y * s.y * m[1] + s.z * s.z * m[2]
         + 2.0 * (s.x * s.y * m[3] + s.x * s.z * m[4] + s.y * s.z * m[5]);

@@ -1,19 +1,13 @@
 // Provides environment_lobe, environment_irradiance: a prefiltered environment, as btfref/render/prefilter.py makes it.
 // Expects environment_maps [2 slices, size, size, 3] and horizon_shares [slices, heights, 1].
 
-#include "lib/parabolic_maps.glsl"
 #include "lib/powers.glsl"
+#include "lib/sphere_maps.glsl"
 
 uniform sampler2DArray environment_maps;
 uniform sampler2DArray horizon_shares;
 
 const float ENVIRONMENT_PI = 3.14159265358979;
-
-// A map over the sphere is a pair of parabolic maps; the second one holds the lower hemisphere, mirrored.
-vec3 sphere_lookup(sampler2DArray maps, int map, int size, vec3 w) {
-    Stencil s = parabolic_stencil(vec3(w.xy, abs(w.z)), size);
-    return parabolic_lookup(maps, 2 * map + (w.z < 0.0 ? 1 : 0), size, s);
-}
 
 // Share of a lobe above the horizon; height is that of its axis.
 float horizon_share(int slice, float height) {

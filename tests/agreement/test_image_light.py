@@ -80,19 +80,19 @@ def test_shader_agrees_with_float64(fits, tables, monkeypatch, rng, key, name):
 
 
 FAULTS = {
-    "lower hemisphere not mirrored": ("w.z < 0.0 ? 1 : 0), size", "w.z < 0.0 ? 0 : 0), size"),
-    "exponents not interpolated": ("float f = position - float(low);", "float f = 0.0;"),
-    "horizon forgotten": ("(n + 1.0) * share)", "(n + 1.0))"),
+    "one hemisphere for both": ("sphere_maps", "(w.z < 0.0 ? 1 : 0), size", "0, size"),
+    "exponents not interpolated": ("environment", "float f = position - float(low);", "float f = 0.0;"),
+    "horizon forgotten": ("environment", "(n + 1.0) * share)", "(n + 1.0))"),
 }
 
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_injected_faults_are_caught(fits, tables, monkeypatch, rng, tmp_path, name):
-    right, wrong = FAULTS[name]
-    text = (shader_directory() / "lib/environment.glsl").read_text()
+    file, right, wrong = FAULTS[name]
+    text = (shader_directory() / f"lib/{file}.glsl").read_text()
     assert text.count(right) == 1
     (tmp_path / "lib").mkdir()
-    (tmp_path / "lib/environment.glsl").write_text(text.replace(right, wrong))
+    (tmp_path / f"lib/{file}.glsl").write_text(text.replace(right, wrong))
     rep = fits("rf_lobes")
     environment, own = tables("rf_lobes", rep, "light")
     monkeypatch.setattr(image_light("rf_lobes"), "tables", classmethod(lambda *_: own))
