@@ -63,6 +63,8 @@ class Source:
     memory: int = MEMORY
 
     def __post_init__(self):
+        # Damaged values may be infinite or NaN: whoever stores them checks; arithmetic with them is no error here.
+        self.colours = np.errstate(over="ignore", invalid="ignore")(self.colours)
         if self.present is None:
             self.present = np.ones((len(self.views), len(self.lights)), bool)
 

@@ -148,6 +148,18 @@ def test_damaged_mif(change, message, tmp_path):
     assert not (tmp_path / "x.btf.zarr").exists()
 
 
+def test_mif_with_a_signalling_nan(tmp_path):
+    """Arithmetic with it raises an invalid operation; it is refused as any other NaN is."""
+    data = bytearray(mif_of(material.pictures()))
+    at = data.index(material.pictures()[0, 0].astype(np.float32).tobytes())
+    data[at : at + 4] = struct.pack("<I", 0x7F800001)
+    (tmp_path / "x.mif").write_bytes(data)
+    with np.errstate(invalid="raise", over="raise"):
+        assert np.isnan(open_source(tmp_path / "x.mif").colours(0, 0, 1)).any()
+        with pytest.raises(InputError, match="view 0, light 0"):
+            import_btf(tmp_path / "x.mif", tmp_path / "x.btf.zarr")
+
+
 # --- the conversion -----------------------------------------------------------------------------------------------
 
 
