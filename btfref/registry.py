@@ -78,6 +78,7 @@ _ROWS = (
     _row("raw", "Tabulated BTF, interpolated", "Dana et al. 1999"),
     _row("svd", "Global truncated singular value decomposition", "Koudelka et al. 2003"),
     _row("lpca", "Local PCA (eigen-BRDFs per cluster)", "Müller, Meseth, Klein 2003 and 2004"),
+    _row("laplacian", "Laplacian pyramid, components per level", "Ma et al. 2005"),
     _row(
         "rf_poly",
         "Reflectance fields: biquadratic polynomials per view",

@@ -13,8 +13,10 @@ import numpy as np
 
 from btfref.conventions import FILTER_TYPES
 from btfref.errors import InputError
+from btfref.numerics.footprint import MODES
 from btfref.numerics.frames import nearest_rotation
 from btfref.registry import method
+from mitsuba_plugins.footprint import LevelOfDetail
 from mitsuba_plugins.guide import LightGuide
 from mitsuba_plugins.lookup import direction_table, tensor, valid_directions
 
@@ -89,10 +91,15 @@ def make_bsdf():
         sampling   string    "data" (default): light directions by the data; "cosine": by the cosine, for comparison
         views      string    indices of the measured views to keep, such as "0 3 17"; default: all. A lookup that needs
                              another one gives no number
+        lod        string    level of detail: "auto" (default), by the pixel's footprint; "distance", log2 of it; "none"
+        lod_bias   float     added to the level of detail, so that "none" with a bias is a fixed level; default 0
+        lod_unit   float     distance whose level of detail is 0 in mode "distance", > 0; default 1
+        pixel_angle float    that a pixel subtends in radians, for "auto"; default 0: not known, finest level
+        camera     point     from where distances count; default: the origin of each ray
         ========== ========= ==================================================================================
 
         Values hold the light's cosine already. The surface reflects on its front side only; wrap it in
-        ``twosided`` for both.
+        ``twosided`` for both. Methods without levels of detail ignore the parameters that choose one.
         """
 
         def __init__(self, props):
@@ -109,18 +116,14 @@ def make_bsdf():
             own = representation.meta["filter_type"]
             self.filter_type = _choice(props, "filter_type", own, FILTER_TYPES)
             sampling = _choice(props, "sampling", "data", ("data", "cosine"))
-            scale = float(_parameter(props, "scale", 1.0))
-            if not (np.isfinite(scale) and scale >= 0):
-                raise InputError(
-                    "the scale is out of range", field="scale", got=scale, expected="a finite value ≥ 0"
-                )
-            self.scale = mi.Float(scale)
+            self.scale = mi.Float(_number(props, "scale", 1.0, least=0.0))
             affine, self.rotation = uv_transform(_matrix(_parameter(props, "to_uv", None)))
             # Python floats: NumPy scalars would try to read a symbolic operand.
             self.affine = affine.tolist()
             self.key = representation.meta["method"]
             self.maps = Maps(representation, self.filter_type)
             self.evaluator = import_module(method(self.key).plugin).Evaluator(self.maps)
+            self.detail = self._level_of_detail(props)
             self.guide = LightGuide(representation, self.maps.views, sampling)
             flags = (
                 mi.BSDFFlags.GlossyReflection
@@ -131,6 +134,17 @@ def make_bsdf():
             )
             self.m_components = [flags]
             self.m_flags = flags
+
+        def _level_of_detail(self, props):
+            """What chooses λ, or None for a method without levels; parameters are checked either way."""
+            mode = _choice(props, "lod", "auto", MODES)
+            bias = _number(props, "lod_bias", 0.0)
+            unit = _number(props, "lod_unit", 1.0, positive=True)
+            angle = _number(props, "pixel_angle", 0.0, least=0.0)
+            camera = _parameter(props, "camera", None)
+            if not hasattr(self.evaluator, "max_lod"):
+                return None
+            return LevelOfDetail(mode, bias, unit, angle, camera, self.affine, self.maps.shape)
 
         def _uv(self, si):
             return mi.Point2f(*(dr.fma(si.uv.x, a, dr.fma(si.uv.y, b, c)) for a, b, c in self.affine))
@@ -163,7 +177,8 @@ def make_bsdf():
             active = mi.Bool(active) & view_valid & light_valid
             if ctx.mode == mi.TransportMode.Importance:
                 w_view, w_light = w_light, w_view
-            value = self.evaluator.evaluate(self._uv(si), w_light, w_view, active)
+            detail = {} if self.detail is None else self.detail(si)
+            value = self.evaluator.evaluate(self._uv(si), w_light, w_view, active, **detail)
             return dr.select(active, value * self.scale, 0)
 
         def pdf(self, ctx, si, wo, active=True):
@@ -173,7 +188,12 @@ def make_bsdf():
             w_view, view_valid = self._local(si.wi)
             w_light, light_valid = self._local(wo)
             active = mi.Bool(active) & view_valid & light_valid
-            return self.guide.pdf(self.guide.neighbours(self._uv(si), w_view), w_light, active)
+            return self.guide.pdf(self._tables(si, w_view), w_light, active)
+
+        def _tables(self, si, w_view):
+            """Tables of the guide, at the interaction's level of detail."""
+            lod = None if self.detail is None else self.detail(si)["lod"]
+            return self.guide.neighbours(self._uv(si), w_view, lod)
 
         def eval_pdf(self, ctx, si, wo, active=True):
             return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
@@ -184,7 +204,7 @@ def make_bsdf():
                 return bs, mi.Color3f(0)
             w_view, view_valid = self._local(si.wi)
             active = mi.Bool(active) & view_valid
-            w_light = self.guide.sample(self.guide.neighbours(self._uv(si), w_view), sample1, sample2)
+            w_light = self.guide.sample(self._tables(si, w_view), sample1, sample2)
             bs.wo = self._turn(w_light, -1)
             bs.eta = 1.0
             bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
@@ -199,9 +219,13 @@ def make_bsdf():
                 integer = dr.is_integral_v(values.array)
                 flag = mi.ParamFlags.NonDifferentiable if integer else mi.ParamFlags.Differentiable
                 callback.put(name, values, flag)
+            if self.detail is not None:
+                self.detail.traverse(callback)
 
         def parameters_changed(self, keys):
-            self.evaluator.update(self.maps)
+            # A moved camera changes no map. Without keys anything may have changed.
+            if not keys or any(key in self.maps.tensors for key in keys):
+                self.evaluator.update(self.maps)
 
         def to_string(self):
             return (
@@ -233,6 +257,16 @@ def _indices(text):
         return [int(word) for word in str(text).replace(",", " ").split()]
     except ValueError:
         raise InputError("not a list of views", field="views", got=repr(text)) from None
+
+
+def _number(props, name, default, *, least=-np.inf, positive=False):
+    value = float(_parameter(props, name, default))
+    if not (np.isfinite(value) and value >= least and (value > 0 or not positive)):
+        bound = " > 0" if positive else "" if least == -np.inf else f" ≥ {least:g}"
+        raise InputError(
+            f"the {name} is out of range", field=name, got=value, expected=f"a finite value{bound}"
+        )
+    return value
 
 
 def _matrix(transform):

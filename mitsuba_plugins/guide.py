@@ -116,32 +116,49 @@ class LightGuide:
     """
 
     def __init__(self, representation, views, sampling):
-        group, mean = representation.sampling_tables()
-        if sampling == "cosine":
-            group, density = np.zeros_like(group), np.ones((1, mean.shape[1], N_CELLS), np.float32)
+        n_levels = getattr(representation, "sampling_levels", 1)
+        if sampling == "cosine" or n_levels == 1:
+            tables = [representation.sampling_tables()]
         else:
-            density = cell_densities(mean, interpolation.from_arrays(representation.arrays(), "light"))
+            tables = [representation.sampling_tables(level) for level in range(n_levels)]
+        self.shapes = [group.shape for group, _ in tables]
+        if sampling == "cosine":
+            group, n_views = np.zeros(self.shapes[0], np.uint32), tables[0][1].shape[1]
+            density = np.ones((1, n_views, N_CELLS), np.float32)
+        else:
+            lights = interpolation.from_arrays(representation.arrays(), "light")
+            density = np.concatenate([cell_densities(mean, lights) for _, mean in tables])
+            first = np.cumsum([0, *(len(mean) for _, mean in tables)])
+            group = np.concatenate([f + g.ravel() for f, (g, _) in zip(first, tables, strict=False)])
         self.views = views
-        self.shape = group.shape
         self.n_views = density.shape[1]
         self.single_group = density.shape[0] == 1
         self.group = mi.UInt32(np.ascontiguousarray(group, np.uint32).ravel())
         self.density = mi.Float(density.ravel())
         self.alias = mi.UInt32(alias_tables(density.reshape(-1, N_CELLS)).ravel())
-        dr.eval(self.group, self.density, self.alias)
+        start = np.cumsum([0, *(rows * columns for rows, columns in self.shapes)])
+        sizes = [[*shape, at, 0] for shape, at in zip(self.shapes, start, strict=False)]
+        self.sizes = mi.UInt32(np.array(sizes, np.uint32).ravel())
+        dr.eval(self.group, self.density, self.alias, self.sizes)
 
-    def _first_table(self, uv):
-        """Index of the tables of the texel's group."""
+    def _first_table(self, uv, lod):
+        """Index of the tables of the group of the texel, of the level nearest to ``lod`` where there are levels."""
         if self.single_group:
             return mi.UInt32(0)
         from mitsuba_plugins.lookup import texel_stencil
 
-        (texel,), _ = texel_stencil(uv, self.shape, "nearest")
+        if lod is None or len(self.shapes) == 1:
+            (texel,), _ = texel_stencil(uv, self.shapes[0], "nearest")
+        else:
+            level = mi.UInt32(dr.clip(lod + 0.5, 0, len(self.shapes) - 1))
+            rows, columns, first, _ = dr.gather(mi.Array4u, self.sizes, level)
+            (texel,), _ = texel_stencil(uv, (rows, columns), "nearest")
+            texel = first + texel
         return dr.gather(mi.UInt32, self.group, texel) * self.n_views
 
-    def neighbours(self, uv, w_view):
+    def neighbours(self, uv, w_view, lod=None):
         """Tables that the view direction blends, as a list of (table, weight); weights sum to 1."""
-        first = self._first_table(uv)
+        first = self._first_table(uv, lod)
         return [
             (first + view, weight)
             for neighbour in self.views.stencil(w_view)

@@ -307,7 +307,7 @@ class PairTable:
         self.words = dr.reinterpret_array(mi.Float, mi.UInt32(words.ravel()))
         dr.eval(self.words)
 
-    def combine(self, outer, views, lights, coefficients, active=True):
+    def combine(self, outer, views, lights, coefficients, active=True, total=None):
         """Interpolate over views and lights, and combine the colours of an entry linearly.
 
         Parameters
@@ -318,6 +318,8 @@ class PairTable:
         coefficients : list of Float
             One for each colour of an entry (three values each); fewer than the entry holds ignore the rest.
         active : Bool
+        total : optional
+            What the sum starts from; default: nothing.
 
         Returns
         -------
@@ -329,8 +331,8 @@ class PairTable:
             coefficients = [c * HALF_SCALE for c in coefficients]
         outer = outer * self.n_views
         pairs = [pair for neighbour in views for pair in neighbour.single()]
+        total = mi.Color3f(0) if total is None else total
         if self.words is None or self.width <= UNROLLED_WIDTH:
-            total = mi.Color3f(0)
             for view, weight in pairs:
                 total = self._add_view(total, outer + view, weight, lights, coefficients, active)
             return total
@@ -342,8 +344,16 @@ class PairTable:
             return step + 1, self._add_view(total, outer + view, weight, lights, coefficients, active)
 
         return dr.while_loop(
-            (mi.UInt32(0), mi.Color3f(0)), lambda step, total: step < len(pairs), body, label="views"
+            (mi.UInt32(0), total), lambda step, total: step < len(pairs), body, label="views"
         )[1]
+
+    def _blend(self, total, values, coefficients, weight):
+        """``total`` plus the weighted combination of an entry's values; by default RGB colours back to back."""
+        return _add(total, values, coefficients, weight)
+
+    def _needed(self, coefficients):
+        """How many of an entry's values these coefficients use."""
+        return 3 * len(coefficients)
 
     def _add_view(self, total, view, weight, lights, coefficients, active):
         """``total`` plus the contribution of one view, interpolated over lights."""
@@ -351,14 +361,16 @@ class PairTable:
         for light in lights:
             if self.words is not None and self.following is not None:
                 words = read_packets(self.words, base + light.index, self.width, active)
-                halves = [widened(word) for word in words[: 3 * len(coefficients)]]
-                total = _add(total, [low for low, _ in halves], coefficients, weight * light.weight)
-                total = _add(
+                halves = [widened(word) for word in words[: self._needed(coefficients)]]
+                total = self._blend(total, [low for low, _ in halves], coefficients, weight * light.weight)
+                total = self._blend(
                     total, [high for _, high in halves], coefficients, weight * light.following_weight
                 )
                 continue
             for index, light_weight in light.single():
-                total = _add(total, self._values(base + index, active), coefficients, weight * light_weight)
+                total = self._blend(
+                    total, self._values(base + index, active), coefficients, weight * light_weight
+                )
         return total
 
     def _values(self, entry, active):

@@ -8,6 +8,8 @@ SUITES = {
     "factors": "btfref.bench.factors",
     "fit": "btfref.bench.fit",
     "lobes": "btfref.bench.lobes",
+    "lod": "btfref.bench.lod",
+    "pyramid": "btfref.bench.pyramid",
     "reflectance": "btfref.bench.reflectance",
     "render": "btfref.bench.render",
     "synth": "btfref.bench.synth",

@@ -20,12 +20,16 @@ def add_arguments(parser):
     parser.add_argument("--only", metavar="METHOD[,METHOD]", help="these methods instead of all")
     parser.add_argument("-o", "--output", metavar="FILE.jsonl", help="append the raw result as one JSON line")
     parser.add_argument("--plot", metavar="FILE.png", help="draw how the cost grows (suite synth)")
+    parser.add_argument(
+        "--report", metavar="FILE.html", help="a page with the pictures, of suites that have any"
+    )
     parser.add_argument("--json", action="store_true", help="print the raw result as JSON")
 
 
 def run(args):
     """Carry the command out."""
     import importlib
+    import inspect
     import json
 
     out = output_file(args.output, ".jsonl") if args.output else None
@@ -34,6 +38,10 @@ def run(args):
         raise InputError("only the suite synth is drawn", field="--plot", got=args.suite, expected="synth")
     suite = importlib.import_module(SUITES[args.suite])
     options = {"only": args.only.split(",")} if args.only else {}
+    if args.report:
+        options["report"] = output_file(args.report, ".html")
+        if "report" not in inspect.signature(suite.run).parameters:
+            raise InputError("this suite has no pictures", field="--report", got=args.suite)
     if args.btf:
         from btfref.sampling import SampledBTF
 

@@ -20,6 +20,12 @@ def add_arguments(parser):
         "--set", nargs="+", action="extend", metavar="KEY=VALUE", help="parameters of the method"
     )
     parser.add_argument("--preset", metavar="NAME", help="named settings, e.g. paper")
+    parser.add_argument(
+        "--target-error",
+        type=float,
+        metavar="E",
+        help="short for --set target_error=E: relative RMS error, for methods that can aim at one",
+    )
     parser.add_argument("--seed", type=count(0), default=0, metavar="N")
     parser.add_argument("--json", action="store_true", help="print the facts of the file as JSON")
 
@@ -30,7 +36,10 @@ def run(args):
 
     row = method(args.method)
     out = output_file(args.output, ".exr")
-    parameters = fit_parameters(row, args.preset, assignments(args.set))
+    given = assignments(args.set)
+    if args.target_error is not None:
+        given["target_error"] = args.target_error
+    parameters = fit_parameters(row, args.preset, given)
 
     from btfref.representations.container import read_info, save
     from btfref.sampling import SampledBTF

@@ -21,7 +21,9 @@ from btfref.scenes import scene_file
 
 def add_arguments(parser):
     """Describe the command's arguments."""
-    parser.add_argument("scene", metavar="SCENE", help="scene file, or plane, sphere, cloth")
+    parser.add_argument(
+        "scene", metavar="SCENE", help="scene file, or plane, sphere, cloth, horizon, turning"
+    )
     parser.add_argument("-o", "--output", required=True, metavar="X.exr", help="the image to write")
     parser.add_argument(
         "-D", dest="define", action="append", metavar="KEY=VALUE", help="parameter of the scene"

@@ -1,9 +1,10 @@
 """Render a Mitsuba scene: the reference image.
 
-SCENE is a Mitsuba XML file, or one of the scenes that btfref ships: plane, sphere, cloth. Any integrator; the
-film becomes float32 with a box filter. Where all lights are directional or points, --noise-free N evaluates
-the material on a regular N × N grid in each pixel, without random numbers. --geometry shows the truth beyond
-every representation: the flat shape replaced by the mesostructure itself, path traced.
+SCENE is a Mitsuba XML file, or one of the scenes that btfref ships: plane, sphere, cloth, horizon, turning.
+Any integrator; the film becomes float32 with a box filter. Where all lights are directional or points,
+--noise-free N evaluates the material on a regular N × N grid in each pixel, without random numbers.
+--geometry shows the truth beyond every representation: the flat shape replaced by the mesostructure itself,
+path traced.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ from btfref.scenes import scene_file
 
 def add_arguments(parser):
     """Describe the command's arguments."""
-    parser.add_argument("scene", metavar="SCENE", help="scene file, or plane, sphere, cloth")
+    parser.add_argument(
+        "scene", metavar="SCENE", help="scene file, or plane, sphere, cloth, horizon, turning"
+    )
     parser.add_argument("-o", "--output", required=True, metavar="X.exr", help="the image to write")
     parser.add_argument(
         "-D", dest="define", action="append", metavar="KEY=VALUE", help="parameter of the scene"

@@ -194,8 +194,8 @@ def representation_defines(rep):
     """Constants that a representation's GLSL file may use.
 
     For each port array NAME of shape (a, b, …, k): ``NAME_DIM0 a``, ``NAME_DIM1 b``, …, the last one counted
-    before the padding to a multiple of 4; ``NAME_STRIDE``, the RGBA texels of one item of the last axis; and
-    every entry of ``rep.meta["constants"]``.
+    before the padding to a multiple of 4 where a map of the file has that name; ``NAME_STRIDE``, the RGBA texels of
+    one item of the last axis; and every entry of ``rep.meta["constants"]``.
 
     Parameters
     ----------
@@ -209,7 +209,8 @@ def representation_defines(rep):
     maps = rep.arrays()
     for name, array in rep.port_arrays().items():
         leading = array.shape[:-1]
-        dimensions = [*leading, maps[name].size // math.prod(leading)]
+        size = maps[name].size if name in maps else array.size
+        dimensions = [*leading, size // math.prod(leading)]
         defines |= {f"{name}_DIM{axis}".upper(): int(size) for axis, size in enumerate(dimensions)}
         defines[f"{name}_STRIDE".upper()] = int(array.shape[-1]) // 4
     constants = rep.meta.get("constants", {})

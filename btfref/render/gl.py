@@ -114,12 +114,15 @@ class ShaderRepresentation:
         File with ``btf_eval``.
     directories : list of path-like
         Where to look for it before the library.
+    texels : (int, int)
+        Rows and columns of the finest level.
     """
 
     textures: dict
     defines: dict
     shader: str
     directories: list
+    texels: tuple = (1, 1)
 
     @classmethod
     def upload(cls, ctx, rep, *, filter_type=None, environment=None):
@@ -144,7 +147,7 @@ class ShaderRepresentation:
             arrays = {**arrays, **packed_arrays(tables)}
             shader, defines["HAS_ENVIRONMENT"] = light.SHADER, True
         textures = {name: upload(ctx, array, name) for name, array in arrays.items()}
-        return cls(textures, defines, shader, directories)
+        return cls(textures, defines, shader, directories, tuple(rep.meta.get("texels", (1, 1))))
 
     def program(self, ctx, vertex, fragment=None, *, varyings=(), defines=None):
         """Compile hosts with this representation; see :func:`compile_program`."""

@@ -22,7 +22,7 @@ from btfref.render.scene import SceneDescription, read_scene
 from btfref.render.shapes import neighbours
 
 
-def realtime(scene, *, parameters=None, grid=4, size=None, views="all"):
+def realtime(scene, *, parameters=None, grid=4, size=None, views="all", count_fetches=False):
     """Render a scene with OpenGL.
 
     Parameters
@@ -37,10 +37,13 @@ def realtime(scene, *, parameters=None, grid=4, size=None, views="all"):
     views : {"all", "needed"}
         "needed" keeps only the maps of those measured views in memory that the camera can see; the picture is the
         same. Asks Mitsuba for the camera's rays; not for a `SceneDescription`.
+    count_fetches : bool
+        Count the texels that the representations fetch: ``meta["fetches"]``, the mean over covered samples.
 
     Returns
     -------
     RenderResult
+        A sample's footprint, and so the level of detail of methods that have levels, is that of 1/n of a pixel.
         ``meta["frame_ms"]`` is the median time of one frame (one sample a pixel), GPU timer and wall clock
         whichever is longer; ``gl_vendor``, ``gl_renderer``, ``gl_version``; ``negative_fraction``, the share
         of channels below zero, and ``not_finite``, their number: nothing is clamped; ``resident_views``, the number
@@ -69,13 +72,15 @@ def realtime(scene, *, parameters=None, grid=4, size=None, views="all"):
     def load_needed(path):
         return representations.load(path, views=needed[path])
 
-    with Renderer(scene, load_needed if needed else None) as renderer:
+    with Renderer(scene, load_needed if needed else None, count_fetches=count_fetches) as renderer:
         offsets = [((i + 0.5) / grid, (j + 0.5) / grid) for j in range(grid) for i in range(grid)]
         total = np.zeros((scene.camera.height, scene.camera.width, 3))
-        times = []
+        times, fetches = [], []
         for offset in offsets:
-            times.append(renderer.draw(offset))
+            times.append(renderer.draw(offset, share=1 / grid))
             total += renderer.read()
+            if count_fetches:
+                fetches.append(renderer.fetches())
         image = (total / len(offsets)).astype(np.float32)
         meta = {
             "renderer": "realtime",
@@ -90,6 +95,9 @@ def realtime(scene, *, parameters=None, grid=4, size=None, views="all"):
             "resident_views": {name: len(kept) for name, kept in needed.items()} if needed else None,
             **gl.facts(renderer.ctx),
         }
+        if count_fetches:
+            counts = np.stack(fetches)
+            meta["fetches"] = float(counts[counts >= 0].mean()) if (counts >= 0).any() else 0.0
     if needed and meta["not_finite"]:
         # Views that are not there give no number: such a picture is not handed out.
         raise BtfrefError(
@@ -106,9 +114,11 @@ class Renderer:
     scene : SceneDescription
     load_file : callable, optional
         ``path -> Representation``; the default reads the files.
+    count_fetches : bool
+        Have :meth:`fetches` tell the texels fetched; a little slower.
     """
 
-    def __init__(self, scene, load_file=None):
+    def __init__(self, scene, load_file=None, *, count_fetches=False):
         if not scene.lights and scene.environment is None:
             raise InputError("the scene has no light", file=scene.source, field="emitter")
         for mesh in scene.meshes:
@@ -134,6 +144,7 @@ class Renderer:
         self._near, self._far = _clip(self.camera, scene.meshes)
         self._lights = _light_uniforms(scene.lights) if scene.lights else {}
         self._n_lights, self._environment = len(scene.lights), scene.environment
+        self._counting = {"COUNT_FETCHES": 1} if count_fetches else {}
         try:
             for mesh in scene.meshes:
                 self._add(mesh, load_file or representations.load)
@@ -162,15 +173,22 @@ class Renderer:
             shown = gl.ShaderRepresentation.upload(
                 self.ctx, rep, filter_type=material.filter_type, environment=self._environment
             )
-            defines = {"N_LIGHTS": self._n_lights}
+            defines = {"N_LIGHTS": self._n_lights, **self._counting}
             program = shown.program(self.ctx, "hosts/mesh.vert", "hosts/mesh.frag", defines=defines)
             self._own(program), self._own(shown)
             self._shown[key] = shown, program, self._own(self.ctx.vertex_array(program, []))
         table = self._own(gl.upload(self.ctx, triangle_table(mesh), "triangles"))
         self._meshes.append((mesh, key, table))
 
-    def draw(self, offset=(0.5, 0.5)):
-        """Draw a frame; ``offset`` is the sample's place in each pixel, from the top left.
+    def draw(self, offset=(0.5, 0.5), *, share=1.0):
+        """Draw a frame.
+
+        Parameters
+        ----------
+        offset : (float, float)
+            The sample's place in each pixel, from the top left.
+        share : float
+            Side of a sample's footprint in pixels, for the level of detail.
 
         Returns
         -------
@@ -181,7 +199,7 @@ class Renderer:
         self._target.use()
         ctx.disable(ctx.BLEND | ctx.CULL_FACE)
         ctx.enable(ctx.DEPTH_TEST)
-        self._target.clear(0.0, 0.0, 0.0, 0.0)
+        self._target.clear(0.0, 0.0, 0.0, -1.0)
         corner, right, down = camera.ray_basis()
         common = {
             "world_to_clip": world_to_clip(camera, offset, self._near, self._far).T,
@@ -204,6 +222,7 @@ class Renderer:
                 row0, row1 = mesh.material.to_uv
                 own = {"uv_row0": row0, "uv_row1": row1, "scale": mesh.material.scale}
                 own["uv_rotation"] = mesh.material.rotation
+                own |= lod_uniforms(mesh.material, shown.texels, share * camera.pixel_angle)
                 gl.set_uniforms(program, {**common, **own, "two_sided": mesh.material.twosided})
                 vertices.render(ctx.TRIANGLES, vertices=3 * len(mesh.faces))
         ctx.finish()
@@ -214,10 +233,34 @@ class Renderer:
         pixels = np.frombuffer(self._target.read(components=3, dtype="f4"), np.float32)
         return pixels.reshape(self.camera.height, self.camera.width, 3)[::-1]
 
+    def fetches(self):
+        """Texels fetched for each pixel of the frame, shape (H, W); −1 where nothing is seen."""
+        pixels = np.frombuffer(self._target.read(components=4, dtype="f4"), np.float32)
+        return pixels.reshape(self.camera.height, self.camera.width, 4)[::-1, :, 3]
+
     def release(self):
         """Give everything on the GPU back."""
         while self._owned:
             self._owned.pop().release()
+
+
+def lod_uniforms(material, texels, angle):
+    """What ``shaders/lib/lod.glsl`` reads.
+
+    Parameters
+    ----------
+    material : BtfMaterial
+    texels : (int, int)
+        Rows and columns of level 0.
+    angle : float
+        That a sample subtends, in radians.
+    """
+    return {
+        "lod_angle": angle if material.lod == "auto" else 0.0,
+        "lod_unit": material.lod_unit if material.lod == "distance" else 0.0,
+        "lod_bias": material.lod_bias,
+        "lod_texels": np.array(texels[::-1], float),
+    }
 
 
 def triangle_table(mesh):

@@ -72,6 +72,7 @@ def render(
         if value is not None and value < 1:
             raise InputError("at least one sample is needed", field=name, got=value, expected="≥ 1")
     with loaded(scene, parameters, variant=variant, size=size) as made:
+        tell_camera(made, 1 / noise_free if noise_free else (spp or _sample_count(made)) ** -0.5)
         start = time.perf_counter()
         if noise_free is not None:
             image, variance = _noise_free(made, noise_free, shadows), None
@@ -168,7 +169,7 @@ def _plain_film(parsed, index):
 def _monte_carlo(scene, spp, seed, with_variance):
     import mitsuba as mi
 
-    spp = spp or int(scene.sensors()[0].sampler().sample_count())
+    spp = spp or _sample_count(scene)
     integrator = scene.integrator()
     if integrator is None:
         raise InputError("the scene has no integrator", field="integrator", expected="such as path")
@@ -196,6 +197,40 @@ def _monte_carlo(scene, spp, seed, with_variance):
         square = square + change * (image - mean)
     variance = (square / (batches - 1) / batches).astype(np.float32)
     return mean.astype(np.float32), variance, {**settings, "spp": count * batches, "batches": batches}
+
+
+def _sample_count(scene):
+    return int(scene.sensors()[0].sampler().sample_count())
+
+
+def tell_camera(scene, share):
+    """Give the camera to the materials that choose a level of detail by the pixel's footprint.
+
+    Stock integrators hand no texture derivatives to a BSDF. A ``pixel_angle`` that the scene itself sets is kept.
+
+    Parameters
+    ----------
+    scene : mitsuba.Scene
+    share : float
+        Side of a sample's footprint in pixels: 1/√spp, as pbrt scales ray differentials, so that the picture
+        converges to the unfiltered one.
+    """
+    import mitsuba as mi
+
+    if "scalar" in mi.variant():
+        return
+    values = mi.traverse(scene.sensors()[0])
+    if "x_fov" not in values:
+        return
+    width = int(scene.sensors()[0].film().size()[0])
+    to_world = np.array(values["to_world"].matrix, float)
+    angle = 2 * np.tan(np.radians(float(values["x_fov"][0])) / 2) / width * share
+    parameters = mi.traverse(scene)
+    for key in [k for k in parameters.keys() if k.split(".")[-1] == "pixel_angle"]:
+        if float(parameters[key][0]) == 0:
+            parameters[key] = mi.Float(angle)
+            parameters[key.removesuffix("pixel_angle") + "camera"] = mi.Point3f(to_world[:3, 3].tolist())
+    parameters.update()
 
 
 def film_rays(sensor, offset):
@@ -245,11 +280,12 @@ def _noise_free(scene, n, shadows):
     total = np.zeros((3, width * height))
     for offset in grid_offsets(n):
         ray, weight = film_rays(sensor, offset)
-        total += np.array(weight * _direct(scene, ray, shadows), float)
+        total += np.array(weight * direct(scene, ray, shadows), float)
     return (total.T / n**2).reshape(height, width, 3).astype(np.float32)
 
 
-def _direct(scene, ray, shadows):
+def direct(scene, ray, shadows):
+    """Radiance along camera rays: Σ over delta lights of incident power × ``bsdf.eval``."""
     import drjit as dr
     import mitsuba as mi
 

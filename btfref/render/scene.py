@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from btfref.errors import InputError, MissingDependencyError
+from btfref.numerics.footprint import MODES
 from btfref.platform import prepare_llvm
 from btfref.render import parsing
 from btfref.render.environment import Environment, from_emitter
@@ -70,6 +71,11 @@ class Camera:
         tan_x, tan_y = self.tangents
         corner = forward + tan_x * left + tan_y * up
         return corner, -2 * tan_x / self.width * left, -2 * tan_y / self.height * up
+
+    @property
+    def pixel_angle(self):
+        """Angle that a pixel at the middle of the image subtends, in radians."""
+        return 2 * self.tangents[0] / self.width
 
     def depth(self, points):
         """Distances of points along the optical axis, shape (..., 3) -> (...)."""
@@ -250,8 +256,20 @@ def _material(parsed, shape):
         raise InputError(
             "the transform mirrors or is singular", file=where, field="to_uv", expected="a determinant > 0"
         )
-    scale = float(props["scale"]) if "scale" in props else 1.0
-    return plugin, BtfMaterial(props["filename"], filter_type, scale, affine, twosided)
+    numbers = {name: float(props[name]) for name in ("scale", "lod_bias", "lod_unit") if name in props}
+    mode = str(props["lod"]) if "lod" in props else "auto"
+    if mode not in MODES:
+        where, expected = parsed.location(node), " or ".join(MODES)
+        raise InputError("unknown level of detail", file=where, field="lod", got=mode, expected=expected)
+    if not numbers.get("lod_unit", 1.0) > 0:
+        where, got = parsed.location(node), numbers["lod_unit"]
+        raise InputError(
+            "the lod_unit is out of range", file=where, field="lod_unit", got=got, expected="> 0"
+        )
+    material = BtfMaterial(
+        props["filename"], filter_type, numbers.pop("scale", 1.0), affine, twosided, lod=mode, **numbers
+    )
+    return plugin, material
 
 
 def _plain(parsed):

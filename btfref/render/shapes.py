@@ -31,6 +31,10 @@ class BtfMaterial:
         determinant.
     twosided : bool
         Inside a ``twosided`` BSDF.
+    lod : {"auto", "distance", "none"}
+        How the level of detail is chosen, for methods with levels.
+    lod_bias, lod_unit : float
+        Added to it; distance at which it is 0 in mode "distance".
     """
 
     filename: str
@@ -38,6 +42,9 @@ class BtfMaterial:
     scale: float
     to_uv: np.ndarray
     twosided: bool
+    lod: str = "auto"
+    lod_bias: float = 0.0
+    lod_unit: float = 1.0
 
     @property
     def rotation(self):

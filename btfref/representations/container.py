@@ -138,7 +138,8 @@ def read_info(path):
         ``maps`` with the shape, type and bytes of each, ``payload_bytes`` (the maps alone, counted as the papers
         count: no direction tables, an index map at the width its codebook needs), ``file_bytes``, ``raw_bytes`` (the
         BTF as 32-bit floats), ``ratio``, ``parameters``, ``fit`` (what the fit measured of itself),
-        ``parent``, ``versions``.
+        ``parent``, ``versions``; for methods whose paper counts the bytes of
+        a layout of its own, ``published_layout`` with those.
     """
     manifest, parts = _open(path, header_only=True)
     meta, maps = manifest["meta"], manifest["arrays"]
@@ -161,6 +162,7 @@ def read_info(path):
         "file_bytes": Path(path).stat().st_size,
         "raw_bytes": raw,
         "ratio": raw / payload,
+        **({"published_layout": meta["published_layout"]} if "published_layout" in meta else {}),
         "parameters": meta["parameters"],
         "fit": meta.get("fit", {}),
         "parent": meta["parent"],

@@ -19,23 +19,25 @@ def feature_views(n_views):
     return np.unique(np.linspace(0, n_views - 1, min(N_FEATURE_VIEWS, n_views)).round().astype(int))
 
 
-def texel_groups(tables):
+def texel_groups(tables, n_groups=N_GROUPS):
     """Partition texels by the shape of their reflectance, whatever its amount.
 
     Parameters
     ----------
     tables : ndarray, shape (n_texels, n_features)
         Luminance of B at a subset of direction pairs.
+    n_groups : int
+        At most so many.
 
     Returns
     -------
     ndarray of uint32, shape (n_texels,)
-        Labels below ``N_GROUPS``; the same for the same tables.
+        Labels below ``n_groups``; the same for the same tables.
     """
     tables = np.asarray(tables, np.float32)
     total = np.abs(tables).sum(1, keepdims=True)
     shape = tables / np.where(total > 0, total, 1)
-    labels, _ = lloyd(shape, min(N_GROUPS, len(tables)), np.random.default_rng(0))
+    labels, _ = lloyd(shape, min(n_groups, len(tables)), np.random.default_rng(0))
     return labels.astype(np.uint32)
 
 

@@ -82,31 +82,38 @@ def evaluate_tabulated(representation, kernel, uv, w_light, w_view):
     return evaluate_points(lookup, uv, w_light, w_view)
 
 
-def evaluate_points(lookup, uv, w_light, w_view):
+def evaluate_points(lookup, uv, w_light, w_view, *scalars):
     """Evaluate point by point: broadcast, leave out what is not valid, bound the memory.
 
     Parameters
     ----------
     lookup : callable
-        ``uv (N, 2), w_light (N, 3), w_view (N, 3) -> (N, 3)`` float64, for valid directions.
+        ``uv (N, 2), w_light (N, 3), w_view (N, 3), *scalars (N,) -> (N, 3)`` float64, for valid directions.
     uv, w_light, w_view : array_like, shape (..., 2), (..., 3), (..., 3)
+    *scalars : array_like, shape (...)
+        Further arguments of each lookup, such as a level of detail.
 
     Returns
     -------
     ndarray of float64, shape (..., 3)
     """
     uv, w_light, w_view = (np.asarray(a, float) for a in (uv, w_light, w_view))
-    shape = np.broadcast_shapes(uv.shape[:-1], w_light.shape[:-1], w_view.shape[:-1])
+    scalars = [np.asarray(a, float) for a in scalars]
+    shape = np.broadcast_shapes(
+        uv.shape[:-1], w_light.shape[:-1], w_view.shape[:-1], *(a.shape for a in scalars)
+    )
     uv, w_light, w_view = (
         np.broadcast_to(a, (*shape, a.shape[-1])).reshape(-1, a.shape[-1]) for a in (uv, w_light, w_view)
     )
+    scalars = [np.broadcast_to(a, shape).reshape(-1) for a in scalars]
     result = np.zeros((len(uv), 3))
     for start in range(0, len(uv), CHUNK):
         part = slice(start, start + CHUNK)
         valid = conventions.valid_directions(w_light[part]) & conventions.valid_directions(w_view[part])
         if not valid.any():
             continue
-        result[part][valid] = lookup(uv[part][valid], w_light[part][valid], w_view[part][valid])
+        points = (a[part][valid] for a in (uv, w_light, w_view, *scalars))
+        result[part][valid] = lookup(*points)
     return result.reshape(*shape, 3)
 
 

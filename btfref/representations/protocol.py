@@ -30,7 +30,8 @@ class Representation(Protocol):
         w_light, w_view : array_like, shape (..., 3)
             Unit vectors in the local frame; the leading shapes broadcast.
         lod : float
-            Level of detail, 0 = finest; methods without levels ignore it.
+            Level of detail, 0 = finest, a step for each halving of the resolution; methods without levels ignore it,
+            those with levels also take one value a lookup.
 
         Returns
         -------
@@ -46,7 +47,10 @@ class Representation(Protocol):
         """
 
     def port_arrays(self) -> dict[str, np.ndarray]:
-        """The maps as the ports read them: last axis a multiple of 4, what one lookup needs contiguous."""
+        """The maps as the ports read them: last axis a multiple of 4, what one lookup needs contiguous.
+
+        Their names are those of samplers and of Mitsuba's parameters; several maps may become one.
+        """
 
     def sampling_tables(self) -> tuple[np.ndarray, np.ndarray]:
         """Guide of importance sampling.

@@ -3,6 +3,7 @@
 
 #include "lib/frame.glsl"
 #include "lib/lights.glsl"
+#include "lib/lod.glsl"
 #include "lib/triangle_table.glsl"
 #include "representation"
 
@@ -34,6 +35,10 @@ void main() {
     // As Mitsuba's twosided: seen from behind, both directions are mirrored at the surface, the frame stays.
     float side = two_sided && w_view.z < 0.0 ? -1.0 : 1.0;
     w_view.z *= side;
+    float lod = lod_of(point, uv_row0, uv_row1, -direction, distance(point.position, camera_origin));
+#ifdef COUNT_FETCHES
+    fetches = 0;  // of the geometry
+#endif
     vec3 sum = vec3(0.0);
 #if N_LIGHTS > 0
     for (int i = 0; i < N_LIGHTS; ++i) {
@@ -42,7 +47,7 @@ void main() {
         vec3 w_light = to_local * towards;
         w_light.z *= side;
         // B holds the cosine of the light (design: conventions), nothing else is multiplied.
-        sum += irradiance * btf_eval(uv, w_light, w_view, 0.0);
+        sum += irradiance * btf_eval(uv, w_light, w_view, lod);
     }
 #endif
 #ifdef HAS_ENVIRONMENT
@@ -50,5 +55,10 @@ void main() {
     to_world[2] *= side;
     sum += btf_environment(uv, w_view, to_world);
 #endif
+#ifdef COUNT_FETCHES
+    // Instead of coverage: the texels that the representation fetched.
+    radiance = vec4(scale * sum, float(fetches));
+#else
     radiance = vec4(scale * sum, 1.0);
+#endif
 }

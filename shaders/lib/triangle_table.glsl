@@ -10,6 +10,9 @@ struct SurfacePoint {
     vec3 normal;
     vec3 dp_du;
     vec2 uv;
+    vec3 plane_normal;  // of the triangle, unit length
+    vec3 gradient_u;    // change of u and v per unit length in the triangle's plane
+    vec3 gradient_v;
 };
 
 // Barycentric coordinates of the point where a ray meets a triangle's plane (Moeller and Trumbore 1997, eq. 6).
@@ -61,5 +64,13 @@ SurfacePoint scene_intersect(sampler2DArray triangles, int rasterized, vec3 orig
     vec2 uv_a = vec2(a.w, n_a.w);
     s.uv = uv_a + at_point.y * (vec2(b.w, n_b.w) - uv_a) + at_point.z * (vec2(c.w, n_c.w) - uv_a);
     s.dp_du = table_fetch(triangles, at + 6).xyz;
+    vec3 edge1 = b.xyz - a.xyz, edge2 = c.xyz - a.xyz, area = cross(edge1, edge2);
+    float squared = max(dot(area, area), 1e-37);
+    vec2 uv1 = vec2(b.w, n_b.w) - uv_a, uv2 = vec2(c.w, n_c.w) - uv_a;
+    // Gradients of the barycentric coordinates of b and c.
+    vec3 of_b = cross(edge2, area) / squared, of_c = cross(area, edge1) / squared;
+    s.gradient_u = uv1.x * of_b + uv2.x * of_c;
+    s.gradient_v = uv1.y * of_b + uv2.y * of_c;
+    s.plane_normal = area * inversesqrt(squared);
     return s;
 }

@@ -180,3 +180,41 @@ def test_a_wrong_density_is_caught(fits, llvm, tmp_path, monkeypatch):
         ires=16,
     )
     assert not test.run(tolerance("chi2.significance"), quiet=True)
+
+
+@pytest.mark.parametrize("lod", [0.5, 1.0, 2.3, 3.0, 4.0])
+def test_sampling_at_every_level_of_detail(fits, lod, llvm, tmp_path, monkeypatch):
+    """χ² with the density, weights that are value over density, and no more variance than cosine sampling."""
+    import drjit as dr
+
+    monkeypatch.chdir(tmp_path)
+    mi, path = llvm, fits.path("laplacian")
+    bsdf, context = load(mi, path, lod="none", lod_bias=lod), mi.BSDFContext()
+    w_view = unit(VIEWS["oblique"])
+
+    def sample(s):
+        si = interaction(mi, dr.width(s), UVS[1], w_view)
+        bs, weight = bsdf.sample(context, si, s[0], mi.Point2f(s[1], s[2]))
+        value = bsdf.eval(context, si, bs.wo)
+        allowed = tolerance("sample.weight.max") * dr.maximum(dr.abs(value), 1e-4)
+        right = dr.all(dr.abs(weight * bs.pdf - value) <= allowed)
+        return bs.wo, dr.select((bs.pdf > 0) & right, mi.Float(1), 0)
+
+    test = mi.chi2.ChiSquareTest(
+        domain=mi.chi2.SphericalDomain(),
+        sample_func=sample,
+        pdf_func=lambda w: bsdf.pdf(context, interaction(mi, dr.width(w), UVS[1], w_view), w),
+        sample_dim=3,
+        sample_count=SAMPLES,
+        ires=16,
+    )
+    assert test.run(tolerance("chi2.significance"), test_count=5, quiet=True), test.messages
+    w, solid_angle = grid(48, 128)
+    uv = np.random.default_rng(11).random((32, 2))
+    si = interaction(mi, len(uv) * len(w), np.repeat(uv, len(w), 0).T, w_view)
+    w_light = mi.Vector3f(np.tile(w, (len(uv), 1)).T)
+    value = np.array(bsdf.eval(context, si, w_light), float).reshape(3, len(uv), len(w)).mean(0)
+    density = np.array(bsdf.pdf(context, si, w_light), float).reshape(len(uv), len(w))
+    first = value @ solid_angle
+    guided, cosine = ((value**2 / d) @ solid_angle - first**2 for d in (density, w[:, 2] / np.pi))
+    assert guided.sum() / cosine.sum() <= tolerance("sample.variance_ratio.max")

@@ -1,0 +1,207 @@
+"""Level of detail: what it takes off the error of one sample a pixel, off flicker, and off the cost of far surfaces.
+
+The truth is the same representation without levels of detail at 1024 samples a pixel, by the reference renderer.
+Flicker is the RMS over pixels of what changes between consecutive frames beyond what changes in the truth, relative to
+the truth's mean.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from btfref.bench.timing import interleaved, machine, summary
+
+#: Scene: the parameter that moves, and its step between frames.
+MOVES = {"horizon": ("advance", 0.04), "turning": ("turn", 0.5)}
+
+#: n of the n × n samples of the truth.
+TRUTH = 32
+
+FRAMES = 2
+
+#: Tiles along the plane of the cost: texels of several pixels, and a texture of far less than one.
+NEAR, FAR = 1, 512
+
+SIZE = (256, 256)
+
+
+def run(*, quick=False, progress=None, btf=None, only=None, report=None):
+    """Errors, flicker, fetches and times.
+
+    Parameters
+    ----------
+    quick : bool
+        Two frames, 144 samples.
+    progress : callable, optional
+    btf : SampledBTF, optional
+        Default: a checker of 64² texels.
+    only : sequence of str, optional
+        Among "horizon", "turning", "cost".
+    report : path-like, optional
+        HTML page with the pictures.
+
+    Returns
+    -------
+    dict
+        ``summary``: by scene, ``error`` and ``flicker`` without and with level of detail, of each renderer, and their
+        ``ratio``; ``cost``: near and far, fetches of GLSL and times; ``raw``: seconds.
+    """
+    from btfref.bench.data import checker
+    from btfref.registry import method
+    from btfref.representations import save
+
+    btf = btf or checker(spp=16, progress=progress)
+    tell = progress or (lambda *_: None)
+    frames, grid = (2, 12) if quick else (FRAMES, TRUTH)
+    found, cells, raw = {}, [], {}
+    with tempfile.TemporaryDirectory() as folder:
+        path = str(Path(folder) / "bench.laplacian.exr")
+        save(method("laplacian").fit(btf, progress=progress), path)
+        for scene in [s for s in MOVES if only is None or s in only]:
+            found[scene], pictures = _moving(scene, path, frames, grid, tell)
+            cells.append(_cell(scene, pictures, found[scene]))
+        if only is None or "cost" in only:
+            found["cost"], raw = _cost(path, 5 if quick else 9, tell)
+    result = {
+        "suite": "lod",
+        "parameters": {"frames": frames, "samples": grid**2, "size": SIZE},
+        "raw": raw,
+        "summary": found,
+        "machine": machine(),
+    }
+    if report is not None:
+        from btfref.report import write_report
+
+        facts = {"machine": result["machine"], "found": found}
+        write_report(report, title="Level of detail", cells=cells, facts=facts)
+    return result
+
+
+def _moving(scene, path, frames, grid, tell):
+    """Error and flicker of a scene, and the pictures of its first frame."""
+    from btfref.render.realtime import realtime
+    from btfref.render.reference import render
+    from btfref.scenes import scene_file
+
+    file, (moved, step) = scene_file(scene), MOVES[scene]
+    kinds = ("none", "auto")
+    pictures = {(kind, r): [] for kind in kinds for r in ("GLSL", "Mitsuba")}
+    truth = []
+    for frame in range(frames):
+        tell(frame, frames, scene)
+        parameters = {"btf": path, moved: str(frame * step)}
+        truth.append(
+            render(file, parameters=parameters | {"lod": "none"}, noise_free=grid, shadows=False).image
+        )
+        for kind in kinds:
+            own = parameters | {"lod": kind}
+            pictures[kind, "GLSL"].append(realtime(file, parameters=own, grid=1).image)
+            pictures[kind, "Mitsuba"].append(render(file, parameters=own, noise_free=1, shadows=False).image)
+    truth = np.stack(truth).astype(float)
+    seen = (truth != 0).any(-1)
+    mean = truth[seen].mean()
+    # A silhouette that moves changes a pixel wholly, with and without levels: only what is seen in both frames counts.
+    both = seen[1:] & seen[:-1]
+    result = {"error": {}, "flicker": {}}
+    for (kind, renderer), images in pictures.items():
+        images = np.stack(images).astype(float)
+        result["error"].setdefault(renderer, {})[kind] = _rms((images - truth)[seen]) / mean
+        change = np.diff(images, axis=0) - np.diff(truth, axis=0)
+        result["flicker"].setdefault(renderer, {})[kind] = _rms(change[both]) / mean
+    for figure in ("error", "flicker"):
+        for values in result[figure].values():
+            values["ratio"] = values["none"] / values["auto"]
+    shown = {"reference": truth[0].astype(np.float32), "1 sample, with levels": pictures["auto", "GLSL"][0]}
+    return result, shown | {"1 sample, without": pictures["none", "GLSL"][0]}
+
+
+def _rms(values):
+    return float(np.sqrt((values**2).mean()))
+
+
+def _cell(scene, pictures, found):
+    """The scene's part of the report."""
+    from btfref.compare import Measured, compare, judge
+    from btfref.report import Cell
+
+    comparison = compare(pictures["1 sample, with levels"], pictures["reference"], flip=False)
+    gates = ()
+    if scene == "horizon":
+        gates = judge("lod.antialiasing", {"error_ratio": Measured(found["error"]["GLSL"]["ratio"])})
+    notes = "; ".join(
+        f"{figure} {values['none']:.4f} without, {values['auto']:.4f} with levels ({renderer})"
+        for figure in ("error", "flicker")
+        for renderer, values in found[figure].items()
+    )
+    return Cell(f"{scene}, one sample a pixel", pictures, comparison, notes, tuple(gates))
+
+
+def _cost(path, rounds, tell):
+    """Fetches and times of a plane that fills the picture, near and far."""
+    import drjit as dr
+
+    from btfref.render import reference
+    from btfref.render.realtime import Renderer, realtime
+    from btfref.render.scene import read_scene
+    from btfref.scenes import scene_file
+
+    file = scene_file("plane")
+    parameters = {k: {"btf": path, "tiling": str(n)} for k, n in (("near", NEAR), ("far", FAR))}
+    fetches = {
+        k: realtime(file, parameters=p, grid=1, size=SIZE, count_fetches=True).meta["fetches"]
+        for k, p in parameters.items()
+    }
+    tell(1, 3, "GLSL")
+    renderers = {k: Renderer(read_scene(file, p, size=SIZE)) for k, p in parameters.items()}
+    try:
+        raw = {"GLSL": interleaved({k: r.draw for k, r in renderers.items()}, rounds)}
+    finally:
+        for renderer in renderers.values():
+            renderer.release()
+    tell(2, 3, "Mitsuba")
+    with contextlib.ExitStack() as stack:
+        tasks = {}
+        for k, p in parameters.items():
+            made = stack.enter_context(reference.loaded(file, p, size=SIZE))
+            reference.tell_camera(made, 1.0)
+            tasks[k] = _reference_task(reference, dr, made)
+        raw["Mitsuba"] = interleaved(tasks, rounds)
+    times = {name: summary(t, "near") for name, t in raw.items()}
+    return {"fetches": fetches | {"ratio": fetches["far"] / fetches["near"]}, "times": times}, raw
+
+
+def _reference_task(reference, dr, scene):
+    """Noise-free shading of a few samples a pixel."""
+
+    def task():
+        for offset in reference.grid_offsets(4):
+            ray, _ = reference.film_rays(scene.sensors()[0], offset)
+            dr.eval(reference.direct(scene, ray, False))
+        dr.sync_thread()
+
+    return task
+
+
+def table(result):
+    """Rows for people."""
+    header = ("scene", "figure", "renderer", "without / near", "with / far", "ratio")
+    rows = []
+    for scene, found in result["summary"].items():
+        if scene == "cost":
+            f = found["fetches"]
+            rows.append(
+                (scene, "fetches", "GLSL", f"{f['near']:.1f}", f"{f['far']:.1f}", f"{f['ratio']:.3f}")
+            )
+            for renderer, t in found["times"].items():
+                near, far = (1e3 * t[k]["median_s"] for k in ("near", "far"))
+                rows.append((scene, "ms", renderer, f"{near:.1f}", f"{far:.1f}", f"{t['far']['ratio']:.3f}"))
+            continue
+        for figure in ("error", "flicker"):
+            for renderer, v in found[figure].items():
+                values = (f"{v[k]:.4f}" for k in ("none", "auto"))
+                rows.append((scene, figure, renderer, *values, f"{v['ratio']:.2f}"))
+    return header, rows

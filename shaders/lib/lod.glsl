@@ -1,0 +1,43 @@
+// Provides lod_of: level of detail of a surface point, from the pixel's footprint or from the distance; sets the step.
+// Expects lib/triangle_table.glsl's SurfacePoint.
+
+#include "lib/footprint.glsl"
+#include "lib/triangle_table.glsl"
+
+uniform float lod_angle;    // that a sample subtends in radians; 0 leaves the footprint out
+uniform float lod_unit;     // distance at which the level of detail is 0; 0 leaves the distance out
+uniform float lod_bias;
+uniform vec2 lod_texels;    // columns and rows of level 0
+
+const float LOD_TINY = 1e-30;  // squared lengths below this count as this
+
+// The same numbers as btfref/numerics/footprint.py, where they are derived.
+const float LOD_ANISOTROPY = 7.0;
+const float LOD_BLUR = 5.0;
+
+// A disk of diameter angle * distance across the ray, stretched by 1/cos(theta) along the ray's projection, is an
+// ellipse of texels (Heckbert 1986). Lookups at the level of its shorter axis are spread along the longer one.
+float lod_of(SurfacePoint point, vec3 uv_row0, vec3 uv_row1, vec3 towards, float distance) {
+    if (lod_unit > 0.0) {
+        return lod_bias + log2(clamp(distance / lod_unit, LOD_TINY, 1e30));
+    }
+    if (lod_angle <= 0.0) {
+        return lod_bias;
+    }
+    vec3 u = lod_texels.x * (uv_row0.x * point.gradient_u + uv_row0.y * point.gradient_v);
+    vec3 v = lod_texels.y * (uv_row1.x * point.gradient_u + uv_row1.y * point.gradient_v);
+    float along_u = dot(u, towards), along_v = dot(v, towards), cosine = dot(point.plane_normal, towards);
+    float stretch = 1.0 / max(cosine * cosine, LOD_TINY);
+    float square = lod_angle * distance * lod_angle * distance;
+    float uu = square * (dot(u, u) + along_u * along_u * stretch);
+    float vv = square * (dot(v, v) + along_v * along_v * stretch);
+    float uv = square * (dot(u, v) + along_u * along_v * stretch);
+    float difference = 0.5 * (uu - vv);
+    float longer = max(0.5 * (uu + vv) + sqrt(difference * difference + uv * uv), LOD_TINY);
+    float shorter = max(uu * vv - uv * uv, LOD_TINY) / longer;
+    footprint_ratio = sqrt(clamp(longer / max(shorter, LOD_TINY), 1.0, LOD_ANISOTROPY * LOD_ANISOTROPY));
+    square = longer / (footprint_ratio * footprint_ratio);
+    vec2 axis = uu >= vv ? vec2(longer - vv, uv) : vec2(uv, longer - uu);
+    footprint_step = axis * sqrt(square / max(dot(axis, axis), LOD_TINY)) / lod_texels;
+    return lod_bias + 0.5 * log2(1.0 + square / LOD_BLUR);
+}
