@@ -24,9 +24,12 @@ TRUTH = 32
 FRAMES = 2
 
 #: Tiles along the plane of the cost: texels of several pixels, and a texture of far less than one.
-NEAR, FAR = 1, 512
+NEAR, FAR = 1, 4096
 
 SIZE = (256, 256)
+
+#: Of the reference renderer's pictures: it records a kernel in Python for each, which small ones would measure.
+LARGE = (1024, 1024)
 
 
 def run(*, quick=False, progress=None, btf=None, only=None, report=None):
@@ -68,7 +71,7 @@ def run(*, quick=False, progress=None, btf=None, only=None, report=None):
             found["cost"], raw = _cost(path, 5 if quick else 9, tell)
     result = {
         "suite": "lod",
-        "parameters": {"frames": frames, "samples": grid**2, "size": SIZE},
+        "parameters": {"frames": frames, "samples": grid**2, "size": SIZE, "large": LARGE},
         "raw": raw,
         "summary": found,
         "machine": machine(),
@@ -166,7 +169,7 @@ def _cost(path, rounds, tell):
     with contextlib.ExitStack() as stack:
         tasks = {}
         for k, p in parameters.items():
-            made = stack.enter_context(reference.loaded(file, p, size=SIZE))
+            made = stack.enter_context(reference.loaded(file, p, size=LARGE))
             reference.tell_camera(made, 1.0)
             tasks[k] = _reference_task(reference, dr, made)
         raw["Mitsuba"] = interleaved(tasks, rounds)
@@ -175,12 +178,11 @@ def _cost(path, rounds, tell):
 
 
 def _reference_task(reference, dr, scene):
-    """Noise-free shading of a few samples a pixel."""
+    """Noise-free shading, one sample a pixel."""
 
     def task():
-        for offset in reference.grid_offsets(4):
-            ray, _ = reference.film_rays(scene.sensors()[0], offset)
-            dr.eval(reference.direct(scene, ray, False))
+        ray, _ = reference.film_rays(scene.sensors()[0], (0.5, 0.5))
+        dr.eval(reference.direct(scene, ray, False))
         dr.sync_thread()
 
     return task
