@@ -9,5 +9,5 @@ vec3 sphere_lookup(sampler2DArray maps, int map, int size, vec3 w) {
     float scale = length(w) + abs(w.z);
     vec2 st = scale > 0.0 ? w.xy * (float(size - 1) / (float(size) * scale)) : vec2(0.0);
     Stencil s = parabolic_stencil(vec3(2.0 * st, 1.0 - dot(st, st)), size);
-    return parabolic_lookup(maps, 2 * map + (w.z < 0.0 ? 1 : 0), size, s);
+    return parabolic_lookup(maps, 2 * map + (w.z < 0.0 ? 1 : 0), size, s, 1);
 }

@@ -135,13 +135,19 @@ def definition(path, parameters, own, rep):
     return value.reshape(*SIZE[::-1], 3)
 
 
-@pytest.mark.parametrize("key", KEYS)
-def test_pictures_of_a_sphere(need, fits, tmp_path, key):
-    """Tight against float64 at the same rays; loose against the path tracer, whose noise must not decide."""
+@pytest.fixture
+def under_sky(need, fits, tmp_path):
+    """``under_sky(key)``: parameters of a sphere under the smooth sky."""
     need("llvm")
     save_image(tmp_path / "sky.exr", smooth_sky().radiance)
-    parameters = {"btf": str(fits.path(key)), "lights": "envmap", "environment": str(tmp_path / "sky.exr")}
-    parameters["tiling"] = "4"
+    lit = {"lights": "envmap", "environment": str(tmp_path / "sky.exr"), "tiling": "4"}
+    return lambda key: {"btf": str(fits.path(key)), **lit}
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_pictures_equal_float64(under_sky, fits, key):
+    """The same approximation, at the same rays."""
+    parameters = under_sky(key)
     classes = pixel_classes(SPHERE, parameters=parameters, grid=1, size=SIZE)
     rep, scene = fits(key), read_scene(SPHERE, parameters, size=SIZE)
     image = realtime(scene, grid=1)
@@ -152,7 +158,24 @@ def test_pictures_of_a_sphere(need, fits, tmp_path, key):
     found = compare(image, exact.astype(np.float32), classes=classes, gate="image.float64", flip=False)
     assert found.passed, [gate.line for gate in found.gates]
 
-    image = realtime(scene, grid=4)
+
+#: What the approximation costs a picture. Lobes under a sky with a sharp horizon: 3.98 % (3.92 to 4.04) of the mean,
+#: which 4 % does not decide.
+LOOSE = [
+    "rf_poly",
+    pytest.param("lafortune", marks=pytest.mark.long),
+    pytest.param("lafortune_lut", marks=pytest.mark.long),
+    pytest.param(
+        "rf_lobes", marks=[pytest.mark.long, pytest.mark.xfail(reason="3.98 % (3.92 to 4.04): undecided")]
+    ),
+]
+
+
+@pytest.mark.parametrize("key", LOOSE)
+def test_pictures_are_near_the_path_tracer(under_sky, key):
+    """The approximation's own error; the reference's noise must not decide."""
+    parameters = under_sky(key)
+    image = realtime(read_scene(SPHERE, parameters, size=SIZE), grid=4)
     classes = pixel_classes(SPHERE, parameters=parameters, grid=4, size=SIZE)
     inside = classes == 1
     spp = 256
@@ -167,8 +190,6 @@ def test_pictures_of_a_sphere(need, fits, tmp_path, key):
         spp = int(spp * max(2.0, 1.2 * (noise / limit) ** 2))
         assert spp < 1 << 17
     found = compare(image, reference, classes=classes, gate="image.environment", flip=False)
-    if key == "rf_lobes" and not found.passed:
-        pytest.xfail("3.98 % (3.92 to 4.04) of the mean, undecided against 4 %: a sky with a sharp horizon")
     assert found.passed, [gate.line for gate in found.gates]
 
 
