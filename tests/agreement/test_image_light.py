@@ -145,15 +145,16 @@ def under_sky(need, fits, tmp_path):
 
 
 @pytest.mark.parametrize("key", KEYS)
-def test_pictures_equal_float64(under_sky, fits, key):
+def test_pictures_equal_float64(under_sky, fits, tables, monkeypatch, key):
     """The same approximation, at the same rays."""
     parameters = under_sky(key)
+    _, own = tables(key, fits(key), "sky")
+    monkeypatch.setattr(image_light(key), "tables", classmethod(lambda *_: own))
     classes = pixel_classes(SPHERE, parameters=parameters, grid=1, size=SIZE)
     rep, scene = fits(key), read_scene(SPHERE, parameters, size=SIZE)
     image = realtime(scene, grid=1)
     assert image.meta["environment"] == "envmap"
     assert (image.image[classes == 1].max(-1) > 0.01).all()
-    own = image_light(key).tables(rep, scene.environment)
     exact = definition(SPHERE, parameters, own, rep)
     found = compare(image, exact.astype(np.float32), classes=classes, gate="image.float64", flip=False)
     assert found.passed, [gate.line for gate in found.gates]
@@ -203,8 +204,10 @@ def test_a_method_without_a_prefiltered_path_is_refused_in_one_line(fits, tmp_pa
     assert not (tmp_path / "x.exr").exists()
 
 
-def test_lights_and_environment_add_up(need, fits, tmp_path, llvm):
+def test_lights_and_environment_add_up(fits, tables, monkeypatch, llvm):
     """A sun and a constant sky in one scene give the sum of their pictures."""
+    _, own = tables("rf_lobes", fits("rf_lobes"), "constant")
+    monkeypatch.setattr(image_light("rf_lobes"), "tables", classmethod(lambda *_: own))
     llvm.set_variant("scalar_rgb")
     look = llvm.ScalarTransform4f().look_at([0.5, -2, 2], [0, 0, 0], [0, 0, 1])
     film = {"type": "hdrfilm", "width": 24, "height": 24}
