@@ -31,6 +31,35 @@ def _files(root):
     return {str(p.relative_to(root)): p.read_bytes() for p in root.rglob("*") if p.is_file()}
 
 
+@pytest.mark.parametrize(("estimator", "target"), [("path", 0.01), ("surface", 0.04)])
+def test_the_target_is_reached_with_honest_variance(tmp_path, tile, estimator, target):
+    stores = [
+        synthesize_store(
+            tmp_path / f"{seed}.btf.zarr",
+            tile,
+            seed=seed,
+            target_error=target,
+            estimator=estimator,
+            **SETTINGS,
+        )
+        for seed in (1, 2)
+    ]
+    (a, va), (b, vb) = (store.read() for store in stores)
+    for store, values, variance in ((stores[0], a, va), (stores[1], b, vb)):
+        reached = np.sqrt(variance.mean(dtype=np.float64)) / values.mean(dtype=np.float64)
+        facts = adaptive.summary(store)
+        assert facts["reached"] == pytest.approx(reached, rel=1e-4)
+        assert reached <= target * tolerance("synthesis.target.exceeded")
+        assert facts["samples"]["least"] < facts["samples"]["mean"] < facts["samples"]["most"]
+    # Independent runs, whose allocations differ. Lights and channels share their paths; texels and views do not.
+    apart = (a.astype(np.float64) - b).mean((1, 4))
+    p = welch_test(apart.mean(), apart.var(ddof=1) / apart.size, 0.0, 0.0)[1]
+    assert p > tolerance("synthesis.z.significance")
+    noisy = (va + vb) > 0
+    z = (a - b)[noisy] / np.sqrt((va + vb)[noisy])
+    assert tolerance("synthesis.z.min_median") <= np.median(np.abs(z)) <= tolerance("synthesis.z.median")
+
+
 def test_samples_go_where_the_variance_is(tile, tmp_path):
     """Fewer samples than a uniform synthesis of the same error, most of them in the noisy texels."""
     store = synthesize_store(tmp_path / "a.btf.zarr", tile, seed=3, target_error=0.01, **SETTINGS)
@@ -43,7 +72,22 @@ def test_samples_go_where_the_variance_is(tile, tmp_path):
     assert np.corrcoef(np.log(samples).ravel(), np.log(noisy + 1e-12).ravel())[0, 1] > 0.5
 
 
-@pytest.mark.parametrize("estimator", ["path"])
+def test_a_limit_per_texel_costs_samples_where_it_is_broken(tmp_path, tile):
+    facts, above = [], []
+    for limit in (10.0, 0.05):
+        store = synthesize_store(
+            tmp_path / f"{limit}.btf.zarr", tile, target_error=0.05, texel_error=limit, **SETTINGS
+        )
+        facts.append(adaptive.summary(store))
+        variance, mean = np.moveaxis(store.maps("reached")[:].astype(np.float64), -1, 0)
+        above.append(np.mean(np.sqrt(variance) > 0.05 * np.maximum(mean, adaptive.FLOOR * mean.mean())))
+    assert facts[1]["samples"]["mean"] > facts[0]["samples"]["mean"]
+    assert facts[0]["texels_above"] == 0
+    assert facts[1]["texels_above"] == pytest.approx(above[1])
+    assert above[1] <= tolerance("synthesis.target.texels_above") < above[0]
+
+
+@pytest.mark.parametrize("estimator", ["path", "surface"])
 def test_same_bytes_in_one_go_in_parts_and_in_small_blocks(tmp_path, tile, estimator, monkeypatch):
     settings = SETTINGS | {"target_error": 0.05, "seed": 7, "estimator": estimator}
     whole, parts = tmp_path / "whole.btf.zarr", tmp_path / "parts.btf.zarr"
