@@ -105,6 +105,7 @@ _ROWS = (
     ),
     _row("cmf", "Chained matrix factorization, clustered", "Suykens, vom Berge, Lagae, Dutré 2003"),
     _row("hf", "Homomorphic factorization, clustered", "McCool, Ang, Ahmad 2001", ports="cmf"),
+    _row("gbrdf", "g-BRDF: height field with editable microfacet materials", "Menzel, Guthe 2009"),
 )
 
 

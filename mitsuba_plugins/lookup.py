@@ -62,18 +62,22 @@ def angle_of(y, x):
     return eighths, rest
 
 
-def texel_stencil(uv, shape, filter_type):
-    """As :func:`btfref.conventions.texel_stencil`: lists of indices and weights."""
-    rows, columns = shape
-    size = mi.Vector2f(columns, rows)
+def texel_position(uv, shape, shift):
+    """Whole part (wrapped, as floats) and fraction of ``uv * size - shift``; not finite counts as 0."""
+    size = mi.Vector2f(shape[1], shape[0])
     uv = dr.select(dr.isfinite(uv), uv, 0)
     # Far out the fraction is taken first, so that texel numbers stay exact; near 0 that would cost accuracy.
     uv = dr.select(dr.abs(uv) > 1024, uv - dr.floor(uv), uv)
-    shift = 0.0 if filter_type == "nearest" else -0.5
-    low = dr.floor(dr.fma(uv, size, shift))
+    low = dr.floor(dr.fma(uv, size, -shift))
     # One rounding, of a number in [0, 1): the integer part cancels inside the fused operation.
-    f = dr.clip(dr.fma(uv, size, shift - low), 0, 1)
-    low = low - size * dr.floor(low / size)
+    f = dr.clip(dr.fma(uv, size, -shift - low), 0, 1)
+    return low - size * dr.floor(low / size), f
+
+
+def texel_stencil(uv, shape, filter_type):
+    """As :func:`btfref.conventions.texel_stencil`: lists of indices and weights."""
+    rows, columns = shape
+    low, f = texel_position(uv, shape, 0.0 if filter_type == "nearest" else 0.5)
     i0 = dr.minimum(mi.Vector2u(low), mi.Vector2u(columns - 1, rows - 1))
     if filter_type == "nearest":
         return [i0.y * columns + i0.x], [mi.Float(1)]

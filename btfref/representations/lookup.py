@@ -141,16 +141,29 @@ def packed_arrays(arrays, **tables):
 
 def base_meta(method, btf, parameters, *, filter_type="bilinear"):
     """The meta that every fit starts from."""
+    return meta_for(
+        method,
+        btf.values.shape[2:4],
+        btf.views,
+        btf.lights,
+        parameters,
+        filter_type=filter_type,
+        parent=btf.attributes,
+    )
+
+
+def meta_for(method, texels, views, lights, parameters, *, filter_type="bilinear", parent=None):
+    """The same for maps that were not fitted to a sampled BTF: its directions, texels and attributes one by one."""
     from btfref.versions import versions
 
     return {
         "method": method,
-        "texels": list(btf.values.shape[2:4]),
-        "views": {"name": btf.views.name, "count": len(btf.views)},
-        "lights": {"name": btf.lights.name, "count": len(btf.lights)},
+        "texels": [int(n) for n in texels],
+        "views": {"name": views.name, "count": len(views)},
+        "lights": {"name": lights.name, "count": len(lights)},
         "filter_type": filter_type,
         "parameters": parameters,
-        "parent": dict(btf.attributes),
+        "parent": dict(parent or {}),
         "versions": versions(),
         "constants": {},
     }

@@ -1,0 +1,267 @@
+"""g-BRDF: a height field with a few microfacet materials, the one representation whose maps are made for editing.
+
+Source: N. Menzel, M. Guthe, "g-BRDFs: An Intuitive and Editable BTF Representation", Computer Graphics Forum 28(8),
+2009, sections 3 and 4. A view ray finds its point on the height field, a second march towards the light shadows it, and
+the point reflects by the distribution-based BRDF of :mod:`btfref.numerics.microfacets` in its tangent frame:
+``B = c_d/π (k1·n) + c_s p(h) F(k1·h) g``.
+
+Differs from the paper: hits are exact roots in bilinear patches instead of a linear search
+(:mod:`btfref.numerics.heightfield`); distributions are RGB; c_s is held below ``(1 − max c_d) / A`` with A the largest
+albedo that the distribution can have, because a distribution of integral 1 alone may reflect up to four times the light.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from btfref import conventions
+from btfref.numerics.heightfield import LIFT, HeightField
+from btfref.numerics.microfacets import geometry_factor, schlick, specular_albedo_bound
+from btfref.numerics.parabolic import bilinear_stencil
+from btfref.representations.guide import group_means, texel_groups
+from btfref.representations.lookup import StoredMaps, evaluate_points
+
+#: "paper": 32 layers of height, windows of 5 × 5, smoothness 0.1 and depth weight 0.2 (section 6).
+PRESETS = {"paper": {"window": 5, "smoothness": 0.1, "depth_weight": 0.2}}
+
+#: Tiles by which a port's hit may differ from the definition's: float32 positions at the far end of the longest ray.
+HIT_TOLERANCE = 2e-6
+
+#: Members of a group of texels whose mean guides importance sampling.
+GUIDE_MEMBERS = 2
+
+#: Texels that are told apart for sampling at a time.
+_BLOCK = 4096
+
+
+class Representation(StoredMaps):
+    """Maps of a g-BRDF, all over [row, column].
+
+    ``height`` [r, c, 1] in [0, 1] between the constants ``height_min`` and ``height_max`` (tile units); ``rotation``
+    [r, c, 1] of the tangent in turns; ``diffuse`` [r, c, 3] c_d; ``fresnel`` [r, c, 1] r0; ``material`` [r, c, 1]
+    uint32; ``ndf`` [material, n, n, 3] parabolic tables of p; ``specular`` [material, 1] c_s; and direction tables, which
+    only guide sampling.
+    """
+
+    @classmethod
+    def from_arrays(cls, arrays, meta):
+        """The representation whose :meth:`arrays` and ``meta`` these are; derived constants are made anew."""
+        return cls(arrays, meta | {"constants": field_constants(arrays, meta["constants"])})
+
+    @cached_property
+    def field(self):
+        """The height field."""
+        return height_field(self.maps["height"], self.meta["constants"])
+
+    @cached_property
+    def specular_scale(self):
+        """c_s of each texel after the limit of energy, float32 (rows, columns).
+
+        ``min(c_s, (1 − max_c c_d) / A)``: the albedo is at most 1 for whatever maps.
+        """
+        material = self.maps["material"][..., 0]
+        own = self.maps["specular"].astype(float)[:, 0][material]
+        bound = specular_albedo_bound(self.maps["ndf"])[material]
+        room = np.maximum(1 - self.maps["diffuse"].astype(float).max(-1), 0)
+        # A step below: rounding to float32 must not exceed the limit.
+        limited = np.minimum(own * bound, room) / np.where(bound > 0, bound, 1) * (1 - 2**-23)
+        return np.where(bound > 0, limited, 0).astype(np.float32)
+
+    @cached_property
+    def port_tables(self):
+        """What the ports and the definition read, by texel; see :meth:`port_arrays`."""
+        turn = 2 * np.pi * self.maps["rotation"].astype(float)
+        surface = np.concatenate([self.field.slopes, np.cos(turn), np.sin(turn)], -1)
+        gloss = np.stack([self.maps["material"][..., 0].astype(np.float32), self.specular_scale], -1)
+        return {
+            "cells": self.field.cells,
+            "surface": surface.astype(np.float32),
+            "colour": np.concatenate([self.maps["diffuse"], self.maps["fresnel"]], -1),
+            "gloss": np.pad(gloss, [(0, 0), (0, 0), (0, 2)]),
+        }
+
+    def port_arrays(self):
+        """``cells`` corner heights; ``surface`` slopes, cosine and sine of the rotation; ``colour`` c_d and r0;
+        ``gloss`` material and limited c_s; ``ndf``; and the direction tables.
+        """  # noqa: D205
+        from btfref.representations.lookup import packed_arrays
+
+        kept = {"ndf", *(name for name in self.maps if name.startswith(("view_", "light_")))}
+        return self.port_tables | packed_arrays({name: self.maps[name] for name in kept})
+
+    def evaluate(self, uv, w_light, w_view, *, lod=0.0):
+        """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored. Never negative."""
+
+        def lookup(uv, w_light, w_view):
+            hit = self.field.view_hits(uv, w_view)
+            return self.shade(hit, w_light, w_view)
+
+        return evaluate_points(lookup, uv, w_light, w_view)
+
+    def spread(self, uv, w_light, w_view, *, tolerance=HIT_TOLERANCE):
+        """How much the definition changes when the hit moves by a tolerance: silhouettes and borders of shadows.
+
+        Parameters
+        ----------
+        uv, w_light, w_view : array_like
+            As for :meth:`evaluate`.
+        tolerance : float
+            Tiles by which ``uv`` moves, in eight directions.
+
+        Returns
+        -------
+        ndarray, shape (..., 3)
+            Largest change of B in 1/sr.
+        """
+        uv = np.asarray(uv, float)
+        uv = np.where(np.isfinite(uv), uv, 0.0)
+        here = self.evaluate(uv, w_light, w_view)
+        largest = np.zeros_like(here)
+        for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1)):
+            moved = self.evaluate(uv + tolerance * np.array([x, y]), w_light, w_view)
+            largest = np.maximum(largest, np.abs(moved - here))
+        return largest
+
+    def shade(self, hit, w_light, w_view, *, shadows=True):
+        """B of points on the surface.
+
+        Parameters
+        ----------
+        hit : btfref.numerics.heightfield.Hit
+        w_light, w_view : ndarray, shape (N, 3)
+            Valid directions.
+        shadows : bool
+            Whether the march towards the light is made.
+
+        Returns
+        -------
+        ndarray of float64, shape (N, 3)
+        """
+        index, weight = texel_weights(hit, self.field.shape, self.meta["filter_type"])
+        flat = {name: table.reshape(-1, table.shape[-1]) for name, table in self.port_tables.items()}
+        surface = np.einsum("nt,ntk->nk", weight, flat["surface"][index].astype(float))
+        tangent, bitangent, normal = surface_frame(surface)
+        cos_light = (w_light * normal).sum(-1)
+        value = np.zeros((len(index), 3))
+        lit = cos_light > 0
+        if shadows:
+            lit[lit] = self.field.lit(hit[lit], w_light[lit])
+        if not lit.any():
+            return value
+        index, weight, cos_light = index[lit], weight[lit], cos_light[lit]
+        colour = flat["colour"][index].astype(float)
+        diffuse = np.einsum("nt,ntc->nc", weight, colour[..., :3]) * (cos_light / np.pi)[:, None]
+        h = w_light[lit] + w_view[lit]
+        length = np.linalg.norm(h, axis=-1, keepdims=True)
+        h = h / np.where(length > 0, length, 1)
+        local = np.stack([(h * axis[lit]).sum(-1) for axis in (tangent, bitangent, normal)], -1)
+        factor = geometry_factor(cos_light, (w_view[lit] * normal[lit]).sum(-1))
+        # Microfacets behind the surface reflect nothing.
+        factor = np.where(local[:, 2] > 0, factor, 0)
+        fresnel = schlick((w_light[lit] * h).sum(-1)[:, None], colour[..., 3])
+        share = weight * flat["gloss"][index, 1] * fresnel
+        material = flat["gloss"][index, 0].astype(np.int64)
+        cell, cell_weight = bilinear_stencil(local, self.maps["ndf"].shape[1])
+        table = self.maps["ndf"].reshape(len(self.maps["ndf"]), -1, 3)
+        p = np.einsum("nk,ntkc->ntc", cell_weight, table[material[:, :, None], cell[:, None]].astype(float))
+        value[lit] = diffuse + factor[:, None] * np.einsum("nt,ntc->nc", share, p)
+        return value
+
+    def sampling_tables(self):
+        """Groups of texels alike (by B from above, without shadows), and means over a few members of each."""
+        rows, columns = self.field.shape
+        views, lights = (self.maps[f"{kind}_directions"].astype(float) for kind in ("view", "light"))
+        some = lights[np.unique(np.linspace(0, len(lights) - 1, min(24, len(lights))).round().astype(int))]
+        some = some[conventions.valid_directions(some)]
+        features = []
+        for first in range(0, rows * columns, _BLOCK):
+            hit = self.field.points(texel_uv(np.arange(first, min(first + _BLOCK, rows * columns)), rows, columns))
+            n = len(hit.height)
+            pole = np.tile([0.0, 0.0, 1.0], (n, 1))
+            values = [self.shade(hit, np.tile(w, (n, 1)), pole, shadows=False) for w in some]
+            features.append(conventions.luminance(np.stack(values, 1)))
+        labels = texel_groups(np.concatenate(features))
+        order = np.argsort(labels, kind="stable")
+        rank = np.arange(len(labels)) - np.searchsorted(labels[order], labels[order])
+        count = np.bincount(labels)[labels[order]]
+        spacing = np.maximum(count // GUIDE_MEMBERS, 1)
+        members = order[(rank % spacing == 0) & (rank // spacing < GUIDE_MEMBERS)]
+        uv = texel_uv(members, rows, columns)
+        means = np.zeros((int(labels.max()) + 1, len(views), len(lights)))
+        for v, view in enumerate(views):
+            table = self.evaluate(uv[:, None], lights[None], view)
+            means[:, v] = group_means(labels[members], conventions.luminance(table).astype(np.float32))
+        return labels.reshape(rows, columns), means
+
+
+def height_field(height, constants):
+    """The field of a map of heights in [0, 1], rounded to float32 as the ports have it."""
+    low, high = constants["height_min"], constants["height_max"]
+    heights = low + (high - low) * np.asarray(height, float)[..., 0]
+    return HeightField(heights.astype(np.float32))
+
+
+def field_constants(arrays, constants):
+    """Constants of the ports, from the maps and ``height_min`` and ``height_max``; the others are kept."""
+    field = height_field(arrays["height"], constants)
+    return constants | {
+        "top": field.top,
+        "bottom": field.bottom,
+        "tangent_limit": float(np.float32(field.tangent_limit)),
+        "lift": LIFT * field.depth,
+        "maximum_steps": field.maximum_steps,
+    }
+
+
+def texel_uv(index, rows, columns):
+    """Texture coordinates of texel centres, shape (N,) -> (N, 2)."""
+    return np.stack([(index % columns + 0.5) / columns, (index // columns + 0.5) / rows], -1)
+
+
+def texel_weights(hit, shape, filter_type):
+    """Texels that a point blends, as flat indices (N, T), and their weights; see `conventions.texel_stencil`."""
+    rows, columns = shape
+    c0, r0 = hit.cell.T
+    c1, r1 = (c0 + 1) % columns, (r0 + 1) % rows
+    a, b = hit.local.T
+    if filter_type == "nearest":
+        column, row = np.where(a < 0.5, c0, c1), np.where(b < 0.5, r0, r1)
+        return (row * columns + column)[:, None], np.ones((len(a), 1))
+    index = np.stack([r0 * columns + c0, r0 * columns + c1, r1 * columns + c0, r1 * columns + c1], -1)
+    return index, np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], -1)
+
+
+def surface_frame(surface):
+    """Tangent frame of slopes and of a rotation.
+
+    Parameters
+    ----------
+    surface : ndarray, shape (N, 4)
+        Slopes along u and v, cosine and sine of the rotation (of any length; zero counts as no rotation).
+
+    Returns
+    -------
+    tangent, bitangent, normal : ndarray, shape (N, 3)
+        Orthonormal. Without rotation the tangent is x, projected to the tangent plane.
+    """
+    sx, sy, cosine, sine = np.asarray(surface, float).T
+    one = np.ones_like(sx)
+    normal = np.stack([-sx, -sy, one], -1) / np.sqrt(1 + sx * sx + sy * sy)[:, None]
+    # (1 − n_x², −n_x n_y, −n_x n_z) up to its length, with the cancellation taken out.
+    u = np.stack([1 + sy * sy, -sx * sy, sx], -1)
+    u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    v = np.cross(normal, u)
+    length = np.hypot(cosine, sine)
+    there = length > 0
+    c = np.where(there, cosine / np.where(there, length, 1), 1)[:, None]
+    s = np.where(there, sine / np.where(there, length, 1), 0)[:, None]
+    return c * u + s * v, c * v - s * u, normal
+
+
+def fit(btf, *, seed=0, progress=None, **parameters):
+    """Decompose ``btf``: :func:`btfref.decomposition.pipeline.decompose` with its defaults."""
+    from btfref.decomposition.pipeline import decompose
+
+    return decompose(btf, seed=seed, progress=progress, **parameters).representation

@@ -1,0 +1,85 @@
+"""Dr.Jit port of :mod:`btfref.representations.gbrdf`."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_plugins.heightfield import HeightField
+from mitsuba_plugins.lookup import wide
+from mitsuba_plugins.parabolic import ParabolicMaps, bilinear_stencil
+
+
+class Evaluator:
+    """Marches to the surface, to the light, and evaluates the microfacet materials around the hit."""
+
+    def __init__(self, maps):
+        self.shape, self.filter_type = maps.shape, maps.filter_type
+        self.constants = maps.meta["constants"]
+        self.update(maps)
+
+    def update(self, maps):
+        """Take over changed maps."""
+        tensors = maps.tensors
+        self.field = HeightField(tensors["cells"].array, self.shape, self.constants)
+        self.surface, self.gloss = wide(tensors["surface"]), wide(tensors["gloss"])
+        self.colour, self.ndf = wide(tensors["colour"]), ParabolicMaps(tensors["ndf"])
+
+    def evaluate(self, uv, w_light, w_view, active):
+        """B in 1/sr for valid directions; never negative."""
+        cell, local, height = self.field.view_hit(uv, w_view, active)
+        texels = self._texels(cell, local)
+        tangent, bitangent, normal = self._frame(texels, active)
+        cos_light = dr.dot(w_light, normal)
+        active = active & (cos_light > 0)
+        active &= self.field.lit(cell, local, height, w_light, active)
+        h = w_light + w_view
+        length = dr.norm(h)
+        h = dr.select(length > 0, h / length, mi.Vector3f(0, 0, 1))
+        facet = mi.Vector3f(dr.dot(h, tangent), dr.dot(h, bitangent), dr.dot(h, normal))
+        light, view = dr.maximum(cos_light, 0), dr.maximum(dr.dot(w_view, normal), 0)
+        factor = light / dr.maximum(dr.fma(-light, view, light + view), 1e-30)
+        factor = dr.select(facet.z > 0, factor, 0)
+        grazing = 1 - dr.clip(dr.dot(w_light, h), 0, 1)
+        fifth = dr.square(dr.square(grazing)) * grazing
+        stencil = bilinear_stencil(facet, self.ndf.n)
+        diffuse, gloss = mi.Color3f(0), mi.Color3f(0)
+        for texel, weight in texels:
+            red, green, blue, r0 = dr.gather(mi.Vector4f, self.colour, texel, active)
+            material, amount, _, _ = dr.gather(mi.Vector4f, self.gloss, texel, active)
+            diffuse += weight * mi.Color3f(red, green, blue)
+            share = weight * amount * dr.fma(1 - r0, fifth, r0)
+            gloss += share * self.ndf.lookup(mi.UInt32(material), stencil, active)
+        value = dr.fma(diffuse, light * dr.inv_pi, gloss * factor)
+        return dr.select(active, value, 0)
+
+    def _texels(self, cell, local):
+        """Texels that a point blends and their weights, as `btfref.representations.gbrdf.texel_weights`."""
+        rows, columns = self.shape
+        c0, r0 = mi.UInt32(cell.x), mi.UInt32(cell.y)
+        c1, r1 = c0 + 1, r0 + 1
+        c1, r1 = dr.select(c1 == columns, 0, c1), dr.select(r1 == rows, 0, r1)
+        a, b = local.x, local.y
+        if self.filter_type == "nearest":
+            return [(dr.select(b < 0.5, r0, r1) * columns + dr.select(a < 0.5, c0, c1), mi.Float(1))]
+        return [
+            (r0 * columns + c0, (1 - a) * (1 - b)),
+            (r0 * columns + c1, a * (1 - b)),
+            (r1 * columns + c0, (1 - a) * b),
+            (r1 * columns + c1, a * b),
+        ]
+
+    def _frame(self, texels, active):
+        """Tangent, bitangent and normal, as `btfref.representations.gbrdf.surface_frame`."""
+        total = mi.Vector4f(0)
+        for texel, weight in texels:
+            total = dr.fma(dr.gather(mi.Vector4f, self.surface, texel, active), weight, total)
+        sx, sy, c, s = total
+        normal = dr.normalize(mi.Vector3f(-sx, -sy, 1))
+        u = dr.normalize(mi.Vector3f(dr.fma(sy, sy, 1), -sx * sy, sx))
+        v = dr.cross(normal, u)
+        length = dr.sqrt(dr.fma(c, c, s * s))
+        there = length > 0
+        scale = 1 / dr.select(there, length, 1)
+        c, s = dr.select(there, c * scale, 1), dr.select(there, s * scale, 0)
+        return c * u + s * v, c * v - s * u, normal
