@@ -169,6 +169,29 @@ def make_bsdf():
         def _enabled(ctx):
             return ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
 
+        def _hit(self, uv, w_view, active):
+            """What the evaluator can say about the view alone, and where sampling looks its tables up.
+
+            An evaluator with geometry finds the point that the view sees; others stay at ``uv``.
+            """
+            if not hasattr(self.evaluator, "hit"):
+                return {}, uv
+            hit, surface_uv = self.evaluator.hit(uv, w_view, active)
+            return {"hit": hit}, surface_uv
+
+        def _value(self, ctx, uv, w_light, w_view, active, known):
+            if ctx.mode == mi.TransportMode.Importance:
+                # The view's hit is of no use where the roles are swapped.
+                value = self.evaluator.evaluate(uv, w_view, w_light, active)
+            else:
+                value = self.evaluator.evaluate(uv, w_light, w_view, active, **known)
+            return dr.select(active, value * self.scale, 0)
+
+        def _directions(self, si, wo, active):
+            w_view, view_valid = self._local(si.wi)
+            w_light, light_valid = self._local(wo)
+            return w_view, w_light, mi.Bool(active) & view_valid & light_valid
+
         def eval(self, ctx, si, wo, active=True):
             if not self._enabled(ctx):
                 return mi.Color3f(0)
@@ -180,6 +203,8 @@ def make_bsdf():
             detail = {} if self.detail is None else self.detail(si)
             value = self.evaluator.evaluate(self._uv(si), w_light, w_view, active, **detail)
             return dr.select(active, value * self.scale, 0)
+            w_view, w_light, active = self._directions(si, wo, active)
+            return self._value(ctx, self._uv(si), w_light, w_view, active, {})
 
         def pdf(self, ctx, si, wo, active=True):
             if not self._enabled(ctx):
@@ -194,9 +219,18 @@ def make_bsdf():
             """Tables of the guide, at the interaction's level of detail."""
             lod = None if self.detail is None else self.detail(si)["lod"]
             return self.guide.neighbours(self._uv(si), w_view, lod)
+            w_view, w_light, active = self._directions(si, wo, active)
+            _, place = self._hit(self._uv(si), w_view, active)
+            return self.guide.pdf(self.guide.neighbours(place, w_view), w_light, active)
 
         def eval_pdf(self, ctx, si, wo, active=True):
-            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
+            if not self._enabled(ctx):
+                return mi.Color3f(0), mi.Float(0)
+            w_view, w_light, active = self._directions(si, wo, active)
+            uv = self._uv(si)
+            known, place = self._hit(uv, w_view, active)
+            value = self._value(ctx, uv, w_light, w_view, active, known)
+            return value, self.guide.pdf(self.guide.neighbours(place, w_view), w_light, active)
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             bs = dr.zeros(mi.BSDFSample3f)
@@ -205,11 +239,18 @@ def make_bsdf():
             w_view, view_valid = self._local(si.wi)
             active = mi.Bool(active) & view_valid
             w_light = self.guide.sample(self._tables(si, w_view), sample1, sample2)
+            uv = self._uv(si)
+            known, place = self._hit(uv, w_view, active)
+            neighbours = self.guide.neighbours(place, w_view)
+            w_light = self.guide.sample(neighbours, sample1, sample2)
             bs.wo = self._turn(w_light, -1)
             bs.eta = 1.0
             bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
             bs.sampled_component = 0
-            value, bs.pdf = self.eval_pdf(ctx, si, bs.wo, active)
+            w_light, light_valid = self._local(bs.wo)
+            active &= light_valid
+            value = self._value(ctx, uv, w_light, w_view, active, known)
+            bs.pdf = self.guide.pdf(neighbours, w_light, active)
             usable = active & (bs.pdf > 0)
             return bs, dr.select(usable, value / bs.pdf, 0)
 

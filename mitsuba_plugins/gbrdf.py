@@ -25,9 +25,15 @@ class Evaluator:
         self.surface, self.gloss = wide(tensors["surface"]), wide(tensors["gloss"])
         self.colour, self.ndf = wide(tensors["colour"]), ParabolicMaps(tensors["ndf"])
 
-    def evaluate(self, uv, w_light, w_view, active):
-        """B in 1/sr for valid directions; never negative."""
-        cell, local, height = self.field.view_hit(uv, w_view, active)
+    def hit(self, uv, w_view, active):
+        """The point that a view ray hits, for :meth:`evaluate`, and its texture coordinates, for sampling."""
+        hit = self.field.view_hit(uv, w_view, active)
+        cell, local, _ = hit
+        return hit, (cell + local + 0.5) / mi.Vector2f(self.shape[1], self.shape[0])
+
+    def evaluate(self, uv, w_light, w_view, active, hit=None):
+        """B in 1/sr for valid directions; never negative. A ``hit`` that is known need not be found again."""
+        cell, local, height = hit or self.field.view_hit(uv, w_view, active)
         texels = self._texels(cell, local)
         tangent, bitangent, normal = self._frame(texels, active)
         cos_light = dr.dot(w_light, normal)

@@ -54,29 +54,36 @@ def fifth_power(u):
     return square * square * v
 
 
-def specular_albedo_bound(ndf):
-    """Upper bound, over all views, of the albedo of ``p(h) k1·n / D`` with F = 1.
+def specular_albedo_bound(ndf, r0):
+    """Upper bound, over all views, of the albedo of ``p(h) F(k1·h) k1·n / D``.
 
     Parameters
     ----------
     ndf : ndarray, shape (m, n, n, channels)
         Parabolic tables of p, non-negative.
+    r0 : ndarray, shape (k,)
+        Reflectances at normal incidence in [0, 1].
 
     Returns
     -------
-    ndarray, shape (m,)
-        The largest of the channels. Since ``dω_l = 4 (k2·h) dω_h``, the albedo is ``4 ∫ p g (k2·h) dω_h``, which is
-        linear in the texels of p; a mirror-like p of integral 1 has up to 4.
+    ndarray, shape (m, k)
+        The largest of the channels. Since ``dω_l = 4 (k2·h) dω_h``, the albedo is ``4 ∫ p F g (k2·h) dω_h``: linear in
+        the texels of p and in r0. A mirror-like p of integral 1 has up to 4 for r0 = 1.
     """
-    ndf = np.asarray(ndf, float)
-    m, n = ndf.shape[:2]
-    albedo = _albedo_operator(n) @ np.moveaxis(ndf.reshape(m, n * n, -1), 1, 0).reshape(n * n, -1)
-    return _MARGIN * albedo.max(0).reshape(m, -1).max(1)
+    ndf, r0 = np.asarray(ndf, float), np.asarray(r0, float)
+    m, n, _, channels = ndf.shape
+    table = np.moveaxis(ndf.reshape(m, n * n, channels), 1, 0).reshape(n * n, -1)
+    constant, at_grazing = (operator @ table for operator in _albedo_operators(n))
+    result = np.stack([(r * constant + (1 - r) * at_grazing).max(0) for r in r0], -1)
+    return _MARGIN * result.reshape(m, channels, -1).max(1)
 
 
 @lru_cache(maxsize=8)
-def _albedo_operator(n):
-    """Albedo of each view for a unit value in each texel of an n × n table, shape (views, n²)."""
+def _albedo_operators(n):
+    """Albedo of each view for a unit value in each texel of an n × n table, two of shape (views, n²).
+
+    For F = 1, and for F = (1 − u)^5.
+    """
     fine = n * _FINE
     st = texel_centres(fine).reshape(-1, 2)
     st = st[(st * st).sum(-1) < 1]
@@ -88,12 +95,15 @@ def _albedo_operator(n):
     phi = np.arange(_N_PHI) * (2 * np.pi / _N_PHI)
     theta, phi = (a.ravel() for a in np.meshgrid(theta, phi, indexing="ij"))
     views = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
-    result = np.zeros((len(views), n * n))
-    for row, view in zip(result, views, strict=True):
-        cosine = h @ view
-        cos_light = 2 * cosine * h[:, 2] - view[2]
-        amount = 4 * np.maximum(cosine, 0) * geometry_factor(cos_light, view[2]) * solid_angle
-        row[:] = np.bincount(texel.ravel(), (share * amount[:, None]).ravel(), minlength=n * n)
+    result = np.zeros((2, len(views), n * n))
+    for row, view in enumerate(views):
+        cosine = np.maximum(h @ view, 0)
+        factor = geometry_factor(2 * cosine * h[:, 2] - view[2], view[2])
+        amount = 4 * cosine * factor * solid_angle
+        for operator, values in zip(result, (amount, amount * fifth_power(cosine)), strict=True):
+            operator[row] = np.bincount(
+                texel.ravel(), (share * values[:, None]).ravel(), minlength=n * n
+            )
     return result
 
 

@@ -6,8 +6,8 @@ the point reflects by the distribution-based BRDF of :mod:`btfref.numerics.micro
 ``B = c_d/π (k1·n) + c_s p(h) F(k1·h) g``.
 
 Differs from the paper: hits are exact roots in bilinear patches instead of a linear search
-(:mod:`btfref.numerics.heightfield`); distributions are RGB; c_s is held below ``(1 − max c_d) / A`` with A the largest
-albedo that the distribution can have, because a distribution of integral 1 alone may reflect up to four times the light.
+(:mod:`btfref.numerics.heightfield`); distributions are RGB; c_s is held below ``(1 − max c_d) / A(r0)`` with A the
+largest albedo of the distribution, because one of integral 1 may reflect up to four times the light.
 """
 
 from __future__ import annotations
@@ -31,6 +31,9 @@ HIT_TOLERANCE = 2e-6
 
 #: Members of a group of texels whose mean guides importance sampling.
 GUIDE_MEMBERS = 2
+
+#: Values of r0 at which the bound of a distribution's albedo is tabulated.
+_FRESNEL_NODES = 17
 
 #: Texels that are told apart for sampling at a time.
 _BLOCK = 4096
@@ -59,11 +62,17 @@ class Representation(StoredMaps):
     def specular_scale(self):
         """c_s of each texel after the limit of energy, float32 (rows, columns).
 
-        ``min(c_s, (1 − max_c c_d) / A)``: the albedo is at most 1 for whatever maps.
+        ``min(c_s, (1 − max_c c_d) / A(r0))``: the albedo is at most 1 for whatever maps.
         """
         material = self.maps["material"][..., 0]
         own = self.maps["specular"].astype(float)[:, 0][material]
-        bound = specular_albedo_bound(self.maps["ndf"])[material]
+        # The bound is convex in r0, so that lines between its values at nodes lie above it.
+        nodes = np.linspace(0, 1, _FRESNEL_NODES)
+        table = specular_albedo_bound(self.maps["ndf"], nodes)
+        place = self.maps["fresnel"][..., 0].astype(float) * (_FRESNEL_NODES - 1)
+        low = np.minimum(place.astype(int), _FRESNEL_NODES - 2)
+        t = place - low
+        bound = (1 - t) * table[material, low] + t * table[material, low + 1]
         room = np.maximum(1 - self.maps["diffuse"].astype(float).max(-1), 0)
         # A step below: rounding to float32 must not exceed the limit.
         limited = np.minimum(own * bound, room) / np.where(bound > 0, bound, 1) * (1 - 2**-23)
@@ -124,7 +133,7 @@ class Representation(StoredMaps):
             largest = np.maximum(largest, np.abs(moved - here))
         return largest
 
-    def shade(self, hit, w_light, w_view, *, shadows=True):
+    def shade(self, hit, w_light, w_view, *, lit=None):
         """B of points on the surface.
 
         Parameters
@@ -132,8 +141,8 @@ class Representation(StoredMaps):
         hit : btfref.numerics.heightfield.Hit
         w_light, w_view : ndarray, shape (N, 3)
             Valid directions.
-        shadows : bool
-            Whether the march towards the light is made.
+        lit : ndarray of bool, shape (N,), optional
+            Which points see the light; default: found by the march towards it.
 
         Returns
         -------
@@ -145,9 +154,11 @@ class Representation(StoredMaps):
         tangent, bitangent, normal = surface_frame(surface)
         cos_light = (w_light * normal).sum(-1)
         value = np.zeros((len(index), 3))
-        lit = cos_light > 0
-        if shadows:
+        if lit is None:
+            lit = cos_light > 0
             lit[lit] = self.field.lit(hit[lit], w_light[lit])
+        else:
+            lit = lit & (cos_light > 0)
         if not lit.any():
             return value
         index, weight, cos_light = index[lit], weight[lit], cos_light[lit]
@@ -170,30 +181,44 @@ class Representation(StoredMaps):
         return value
 
     def sampling_tables(self):
-        """Groups of texels alike (by B from above, without shadows), and means over a few members of each."""
+        """Groups of points of the surface alike (by B from above), and means over a few members of each.
+
+        The plugin looks the group up where the view ray hits.
+        """
         rows, columns = self.field.shape
         views, lights = (self.maps[f"{kind}_directions"].astype(float) for kind in ("view", "light"))
         some = lights[np.unique(np.linspace(0, len(lights) - 1, min(24, len(lights))).round().astype(int))]
-        some = some[conventions.valid_directions(some)]
-        features = []
-        for first in range(0, rows * columns, _BLOCK):
-            hit = self.field.points(texel_uv(np.arange(first, min(first + _BLOCK, rows * columns)), rows, columns))
-            n = len(hit.height)
-            pole = np.tile([0.0, 0.0, 1.0], (n, 1))
-            values = [self.shade(hit, np.tile(w, (n, 1)), pole, shadows=False) for w in some]
-            features.append(conventions.luminance(np.stack(values, 1)))
-        labels = texel_groups(np.concatenate(features))
+        features = [
+            self._luminance(np.arange(first, min(first + _BLOCK, rows * columns)), some, np.array([[0, 0, 1.0]]))
+            for first in range(0, rows * columns, _BLOCK)
+        ]
+        labels = texel_groups(np.concatenate(features)[:, 0])
         order = np.argsort(labels, kind="stable")
         rank = np.arange(len(labels)) - np.searchsorted(labels[order], labels[order])
         count = np.bincount(labels)[labels[order]]
         spacing = np.maximum(count // GUIDE_MEMBERS, 1)
         members = order[(rank % spacing == 0) & (rank // spacing < GUIDE_MEMBERS)]
-        uv = texel_uv(members, rows, columns)
-        means = np.zeros((int(labels.max()) + 1, len(views), len(lights)))
-        for v, view in enumerate(views):
-            table = self.evaluate(uv[:, None], lights[None], view)
-            means[:, v] = group_means(labels[members], conventions.luminance(table).astype(np.float32))
+        means = group_means(labels[members], self._luminance(members, lights, views).astype(np.float32))
         return labels.reshape(rows, columns), means
+
+    def _luminance(self, texels, lights, views):
+        """Luminance of B at texel centres on the surface, shape (n, n_views, n_lights)."""
+        n, n_lights = len(texels), len(lights)
+        pairs = np.repeat(np.arange(n), n_lights)
+        w_light = np.tile(lights, (n, 1))
+        hit = self.field.points(texel_uv(texels, *self.field.shape)[pairs])
+        lit = np.zeros(len(pairs), bool)
+        # Directions on the horizon are none that B is asked for.
+        valid = conventions.valid_directions(w_light)
+        lit[valid] = self.field.lit(hit[valid], w_light[valid])
+        seen, w_light = np.flatnonzero(lit), w_light[lit]
+        hit = hit[seen]
+        result = np.zeros((n * n_lights, len(views)))
+        for column, view in enumerate(views):
+            w_view = np.broadcast_to(view, w_light.shape)
+            value = self.shade(hit, w_light, w_view, lit=np.ones(len(seen), bool))
+            result[seen, column] = conventions.luminance(value)
+        return result.reshape(n, n_lights, -1).swapaxes(1, 2)
 
 
 def height_field(height, constants):

@@ -1,0 +1,131 @@
+"""Reciprocal pairs of images: two directions that have changed the roles of light and view.
+
+Source: Menzel and Guthe 2009, eq. 3 and 4: ``L(k1, k2) = ρ(k1, k2) (k1·n) L_i`` with ρ reciprocal.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from btfref.conventions import LUMINANCE
+
+#: Directions further from the normal take no part: their images are foreshortened to little more than silhouettes.
+LARGEST_ANGLE = np.radians(62)
+
+#: Share of the mean luminance below which a sample counts as black: its logarithm would be noise.
+BLACK = 0.01
+
+
+class ReciprocalPairs:
+    """Luminance images of a BTF for pairs of directions.
+
+    Parameters
+    ----------
+    btf : SampledBTF
+        Lights that differ from the views are interpolated by their own stencil.
+    count : int
+        At most so many pairs, drawn with ``seed``.
+    seed : int
+
+    Attributes
+    ----------
+    first, second : ndarray of float64, shape (n, 3)
+        The two directions of each pair.
+    black : float
+        Luminance in 1/sr that :meth:`logarithms` holds.
+    """
+
+    def __init__(self, btf, count, seed=0):
+        self._btf = btf
+        views = btf.views.vectors
+        near = np.flatnonzero(views[:, 2] >= np.cos(LARGEST_ANGLE))
+        a, b = (near[i] for i in np.triu_indices(len(near), 1))
+        if len(a) > count:
+            chosen = np.sort(np.random.default_rng(seed).choice(len(a), count, replace=False))
+            a, b = a[chosen], b[chosen]
+        self._views = np.stack([a, b], 1)
+        self.first, self.second = views[a], views[b]
+        self._light, self._share = btf.lights.stencil(views, hold=False)
+        some = np.asarray(btf.values[:: max(1, len(views) // 8), ::8], np.float32)
+        self.black = BLACK * float((some @ LUMINANCE.astype(np.float32)).mean()) + 1e-12
+
+    def __len__(self):
+        return len(self._views)
+
+    def images(self, pair):
+        """Luminance seen from the first direction under the second one, and the other way round.
+
+        Returns
+        -------
+        tuple of ndarray of float32, shape (rows, columns)
+        """
+        a, b = self._views[pair]
+        return self._image(a, b), self._image(b, a)
+
+    def logarithms(self, pair):
+        """Natural logarithms of :meth:`images`, held at ``black``."""
+        return tuple(np.log(np.maximum(image, self.black)) for image in self.images(pair))
+
+    def _image(self, view, light):
+        total = 0.0
+        for index, share in zip(self._light[light], self._share[light], strict=True):
+            if share:
+                image = np.asarray(self._btf.values[view, index], np.float32) @ LUMINANCE.astype(np.float32)
+                total = total + np.float32(share) * image
+        return np.broadcast_to(np.asarray(total, np.float32), self._btf.values.shape[2:4])
+
+
+def tangent(w):
+    """``w_xy / w_z`` of directions, shape (..., 3) -> (..., 2)."""
+    w = np.asarray(w, float)
+    return w[..., :2] / w[..., 2:]
+
+
+def shifted(image, offset):
+    """An image of the periodic tile, moved so that each texel shows what is ``offset`` away.
+
+    Parameters
+    ----------
+    image : ndarray, shape (rows, columns)
+    offset : sequence of 2 floats
+        Along u and v in tiles; a surface point at height z shows at ``−z tangent(view)``.
+
+    Returns
+    -------
+    ndarray
+        Bilinear between texels.
+    """
+    result = 0.0
+    size = image.shape[::-1]
+    whole = np.floor(np.asarray(offset) * size).astype(int)
+    fx, fy = np.asarray(offset) * size - whole
+    for dy, wy in ((0, 1 - fy), (1, fy)):
+        for dx, wx in ((0, 1 - fx), (1, fx)):
+            if wx * wy > 0:
+                moved = np.roll(image, (-whole[1] - dy, -whole[0] - dx), (0, 1))
+                result = result + np.asarray(wx * wy, image.dtype) * moved
+    return result
+
+
+def surface_stencil(heights, view_tangent):
+    """Texels that show the points of a height map from a view, and their weights.
+
+    Parameters
+    ----------
+    heights : ndarray, shape (rows, columns)
+        Tile units.
+    view_tangent : ndarray, shape (2,)
+
+    Returns
+    -------
+    index : ndarray of int, shape (rows * columns, 4)
+        Flat.
+    weight : ndarray of float32, shape (rows * columns, 4)
+    """
+    from btfref.conventions import texel_stencil
+
+    rows, columns = heights.shape
+    v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
+    uv = np.stack([u, v], -1) - heights[..., None] * view_tangent
+    index, weight = texel_stencil(uv.reshape(-1, 2), heights.shape, "bilinear")
+    return index, weight.astype(np.float32)

@@ -1,0 +1,214 @@
+"""The whole decomposition: heights, normals, fusion, reflectance, materials (Menzel and Guthe 2009, section 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from btfref.decomposition import heights as height_stage
+from btfref.decomposition.materials import cluster_materials
+from btfref.decomposition.normals import fuse, helmholtz_normals
+from btfref.decomposition.pairs import ReciprocalPairs
+from btfref.decomposition.reflectance import SurfaceSamples, material_reflectance, texel_reflectance
+from btfref.errors import InputError
+from btfref.numerics.heightfield import HeightField
+from btfref.representations.lookup import positive_integer
+
+
+@dataclass(frozen=True)
+class Decomposition:
+    """A g-BRDF and how it came about.
+
+    Attributes
+    ----------
+    representation : btfref.representations.gbrdf.Representation
+    stages : dict of str to ndarray
+        ``similarity`` (layers, rows, columns), ``layers``, ``cut`` and ``fused`` heights in tile units, ``slopes`` of the
+        normals, ``texel_diffuse``, ``texel_specular``, ``texel_fresnel``, ``texel_ndf`` in luminance, ``labels``,
+        ``rotation``, ``separation`` (number of materials, index).
+    """
+
+    representation: object
+    stages: dict = field(repr=False)
+
+
+def decompose(
+    btf,
+    *,
+    seed=0,
+    progress=None,
+    depth=0.25,
+    layers=32,
+    pairs=128,
+    window=5,
+    smoothness=0.1,
+    depth_weight=0.2,
+    materials=None,
+    largest=6,
+    ndf_size=32,
+    iterations=4,
+    storage="half",
+    filter_type="bilinear",
+    intermediates=None,
+):
+    """Decompose a sampled BTF into a g-BRDF.
+
+    Parameters
+    ----------
+    btf : SampledBTF
+    seed : int
+        Same seed, same result.
+    progress : callable, optional
+        ``progress(done, total, label)``.
+    depth : float
+        Tile units below z = 0 in which heights are looked for, (0, 4].
+    layers : int
+        Candidate heights.
+    pairs : int
+        Reciprocal pairs of images that take part.
+    window : int
+        Side of the correlation window in texels.
+    smoothness : float
+        Of the minimum cut; see `btfref.decomposition.heights.minimum_cut`.
+    depth_weight : float
+        λ of the fusion of heights and normals, (0, 1].
+    materials : int, optional
+        Number of materials; default: by the separation index, at most ``largest``.
+    largest : int
+    ndf_size : int
+        Texels per side of the distributions, a power of two.
+    iterations : int
+        Alternations of the materials' least squares.
+    storage : {"half", "float"}
+    filter_type : {"bilinear", "nearest"}
+    intermediates : path-like, optional
+        An ``.npz`` file for the maps of every stage.
+
+    Returns
+    -------
+    Decomposition
+
+    Raises
+    ------
+    InputError
+        For parameters out of range, or values that are not finite.
+    """
+    from btfref.representations.gbrdf_build import HEIGHT_LIMIT, from_maps
+
+    named = {"layers": layers, "pairs": pairs, "window": window, "largest": largest, "iterations": iterations}
+    for name, value in named.items():
+        positive_integer(name, value)
+    if materials is not None:
+        positive_integer("materials", materials)
+    if positive_integer("ndf_size", ndf_size) & (ndf_size - 1):
+        raise InputError("a parameter is out of range", field="ndf_size", got=ndf_size, expected="a power of two")
+    for name, value, low, high in (
+        ("depth", depth, 0.0, HEIGHT_LIMIT),
+        ("depth_weight", depth_weight, 0.0, 1.0),
+        ("smoothness", smoothness, -1e-30, np.inf),
+    ):
+        if not (np.isfinite(value) and low < value <= high):
+            expected = f"in ({max(low, 0):g}, {high:g}]"
+            raise InputError("a parameter is out of range", field=name, got=value, expected=expected)
+    _refuse_not_finite(btf)
+    report = progress or (lambda *_: None)
+    shape = btf.values.shape[2:4]
+    reciprocal = ReciprocalPairs(btf, pairs, seed)
+    stages = {"layers": height_stage.height_layers(depth, layers)}
+    volume = height_stage.similarity(reciprocal, stages["layers"], window, report)
+    if volume is None:
+        stages["cut"] = np.zeros(shape)
+    else:
+        stages["similarity"] = volume
+        report(0, 1, "minimum cut")
+        stages["cut"] = height_stage.minimum_cut(volume, stages["layers"], smoothness)
+        report(1, 1, "minimum cut")
+    stages["slopes"], summary = helmholtz_normals(reciprocal, stages["cut"], report)
+    fused = fuse(stages["cut"], stages["slopes"], depth_weight)
+    # Nothing rises above the plane that the BTF was taken on.
+    fused = np.clip(fused, -HEIGHT_LIMIT, 0)
+    stages["fused"] = fused
+
+    low, high = float(fused.min()), float(fused.max())
+    unit = (fused - low) / (high - low) if high > low else np.ones(shape)
+    surface_heights = HeightField((low + (high - low) * unit).astype(np.float32))
+    texels = texel_reflectance(SurfaceSamples(btf, surface_heights), progress=report)
+    stages |= {f"texel_{name}": values for name, values in texels.items()}
+    clustering, separation = cluster_materials(
+        texels["ndf"], shape, largest=largest, count=materials, seed=seed
+    )
+    labels, n_materials = clustering.labels, len(clustering.centres)
+    stages["labels"], stages["rotation"] = labels.reshape(shape), clustering.rotation.reshape(shape)
+    stages["separation"] = np.array(list(separation.items()))
+    share = np.zeros((n_materials, len(labels)))
+    share[labels, np.arange(len(labels))] = 1
+    share /= share.sum(1, keepdims=True)
+    start = {
+        "ndf": np.tensordot(share, texels["ndf"], 1),
+        "specular": share @ texels["specular"],
+        "fresnel": (share @ texels["fresnel"])[labels],
+    }
+    surface = SurfaceSamples(btf, surface_heights, stages["rotation"])
+    found = material_reflectance(
+        surface, labels, n_materials, start=start, size=ndf_size, iterations=iterations, progress=report
+    )
+    parameters = {
+        "seed": seed,
+        "depth": depth,
+        **named,
+        "smoothness": smoothness,
+        "depth_weight": depth_weight,
+        "materials": materials,
+        "ndf_size": ndf_size,
+        "storage": storage,
+    }
+    representation = from_maps(
+        unit,
+        height_min=low,
+        height_max=high,
+        diffuse=found["diffuse"].reshape(*shape, 3),
+        fresnel=found["fresnel"].reshape(shape),
+        rotation=stages["rotation"],
+        material=stages["labels"],
+        ndf=found["ndf"],
+        specular=found["specular"],
+        views=btf.views,
+        lights=btf.lights,
+        filter_type=filter_type,
+        storage=storage,
+        parameters=parameters,
+        parent=btf.attributes,
+    )
+    finite = {str(k): v for k, v in separation.items() if np.isfinite(v)}
+    representation.meta["fit"] = {"materials": n_materials, "separation": finite, "normals": summary}
+    if intermediates is not None:
+        save_stages(stages, intermediates)
+    return Decomposition(representation, stages)
+
+
+def save_stages(stages, path):
+    """Write the maps of the stages as one ``.npz`` file.
+
+    Raises
+    ------
+    InputError
+        When the folder does not exist.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise InputError("the directory does not exist", file=path, got=str(path.parent))
+    temporary = path.with_name(f".{path.name}.partial")
+    try:
+        with temporary.open("wb") as stream:
+            np.savez(stream, **stages)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _refuse_not_finite(btf):
+    for view in range(len(btf.views)):
+        if not np.isfinite(btf.values[view]).all():
+            raise InputError("the BTF holds a value that is not finite", file=getattr(btf, "path", None))
