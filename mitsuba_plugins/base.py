@@ -271,7 +271,7 @@ def make_bsdf():
         def to_string(self):
             return (
                 f"BTF[filename={self.filename}, method={self.key}, filter_type={self.filter_type}, "
-                f"texels={self.maps.shape}]"
+                f"texels={self.maps.shape}, displaced={hasattr(self.evaluator, 'hit')}]"
             )
 
     return BTF

@@ -87,7 +87,9 @@ class HeightField:
         step = dr.select(travel > 0, mi.Vector2f(1), -1)
         limit = self.constants["maximum_steps"]
 
-        def body(going, s, crossed, hit, n, cell, start, travel, z0, dz, inverse, forward, step, moving, lift):
+        def body(
+            going, s, crossed, hit, n, cell, start, travel, z0, dz, inverse, forward, step, moving, lift
+        ):
             local = dr.clip(dr.fma(travel, s, start - crossed), 0, 1)
             height, hx, hy, hxy = self._patch(self._wrapped(cell + crossed), local, going)
             f0 = dr.fma(dz, s, z0) - height + lift
@@ -109,7 +111,23 @@ class HeightField:
             s = dr.select(onward, leave, s)
             n = n + 1
             onward &= n < limit
-            return onward, s, crossed, hit, n, cell, start, travel, z0, dz, inverse, forward, step, moving, lift
+            return (
+                onward,
+                s,
+                crossed,
+                hit,
+                n,
+                cell,
+                start,
+                travel,
+                z0,
+                dz,
+                inverse,
+                forward,
+                step,
+                moving,
+                lift,
+            )
 
         shadow = lift is not None
         state = (

@@ -42,3 +42,10 @@ def probe_points(rng, n, views, lights):
     seam = rng.integers(0, 10, n) == 0
     uv[seam] = np.round(uv[seam])
     return uv.astype(np.float32), *result
+
+
+def hit_allowance(representation, uv, w_light, w_view):
+    """Differences within the stated tolerance of a hit, for methods with geometry; None for the others."""
+    if not hasattr(representation, "spread"):
+        return None
+    return representation.spread(uv, w_light, w_view)

@@ -7,6 +7,7 @@ SUITES = {
     "environment": "btfref.bench.environment",
     "factors": "btfref.bench.factors",
     "fit": "btfref.bench.fit",
+    "gbrdf": "btfref.bench.gbrdf",
     "lobes": "btfref.bench.lobes",
     "lod": "btfref.bench.lod",
     "pyramid": "btfref.bench.pyramid",

@@ -279,18 +279,18 @@ def write_images(image, out, *, png=False, classes=None, classes_out=None):
 
 
 #: Grey levels of a class file per class number, so that a person sees the classes.
-_CLASS_STEP = 100
+_CLASS_GREYS = (0, 100, 200, 250)
 
 
 def save_classes(path, classes):
-    """Write pixel classes (0 background, 1 interior, 2 silhouette) as a grey PNG: black, dark, light."""
+    """Write pixel classes (see `btfref.render.classes`) as a grey PNG: black, dark, light, nearly white."""
     import numpy as np
 
     from btfref.compare.png import encode_png
 
     temporary = path.with_name(f".{path.name}.partial")
     try:
-        temporary.write_bytes(encode_png(np.asarray(classes, np.uint8) * _CLASS_STEP))
+        temporary.write_bytes(encode_png(np.array(_CLASS_GREYS, np.uint8)[classes]))
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -318,8 +318,8 @@ def load_classes(path):
         raise InputError("no such file", file=path, field="--classes") from None
     except (OSError, SyntaxError, ValueError):
         raise InputError("cannot be read as PNG", file=path, field="--classes") from None
-    known = [number * _CLASS_STEP for number in range(3)]
+    known = list(_CLASS_GREYS)
     if not np.isin(grey, known).all():
         odd = int(grey[~np.isin(grey, known)][0])
         raise InputError("not pixel classes", file=path, got=f"grey level {odd}", expected=known)
-    return grey // _CLASS_STEP
+    return np.searchsorted(known, grey).astype(np.uint8)

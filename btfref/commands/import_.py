@@ -1,7 +1,8 @@
 """Convert a measured BTF of another format to a sampled BTF.
 
 Reads UBO2003 and ATRIUM (folder or zip), UTIA (folder, zip or MIF), Bonn SPECTRAL folders, Bonn .btf (DFMF, FMF, PVF,
-BDI) and MERL .binary. An interrupted conversion continues when it is started again with the same arguments.
+BDI) and MERL .binary; maps: a folder of edited maps (of export); photograph: one picture becomes a g-BRDF (both write
+.exr). An interrupted conversion continues when it is started again with the same arguments.
 """
 
 from __future__ import annotations
@@ -21,9 +22,13 @@ from btfref.commands._shared import (
 def add_arguments(parser):
     """Describe the command's arguments."""
     parser.add_argument("path", metavar="PATH", help="file, folder or archive")
-    parser.add_argument("-o", "--output", required=True, metavar="OUT.btf.zarr", help="the store to write")
     parser.add_argument(
-        "--format", metavar="NAME", help="bonn, mif, merl, spectral, utia or ubo; found from the file"
+        "-o", "--output", required=True, metavar="OUT", help="the store (.btf.zarr) or representation (.exr)"
+    )
+    parser.add_argument(
+        "--format",
+        metavar="NAME",
+        help="bonn, mif, merl, spectral, utia or ubo (found from the file), maps, photograph",
     )
     parser.add_argument(
         "--allow-missing", action="store_true", help="accept pairs of directions without image"
@@ -52,6 +57,8 @@ def add_arguments(parser):
 
 def run(args):
     """Carry the command out."""
+    if args.format in ("maps", "photograph"):
+        return _representation(args, output_file(args.output, ".exr"))
     out = output_file(args.output, ".btf.zarr")
 
     from btfref.formats.convert import import_btf
@@ -85,4 +92,25 @@ def run(args):
         emit(f"  {parent['images_missing']} images are missing: {info['coverage']:.2%} of it there")
     if parent["lights_moved"]:
         emit(f"  {len(parent['lights_moved'])} lights were moved out of the camera's way")
+    return 0
+
+
+def _representation(args, out):
+    """A representation from pictures."""
+    from btfref.representations.container import read_info, save
+
+    if args.format == "maps":
+        from btfref.formats.maps import import_maps
+
+        representation = import_maps(args.path)
+    else:
+        from btfref.representations.gbrdf_build import from_photograph
+
+        representation = from_photograph(args.path)
+    save(representation, out)
+    info = read_info(out)
+    if args.json:
+        emit_json(info)
+    else:
+        emit(f"{out}: {info['method']}, maps {bytes_text(info['payload_bytes'])}")
     return 0

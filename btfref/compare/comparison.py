@@ -14,7 +14,7 @@ from btfref.compare.tolerances import gate_table, limits, tolerance
 from btfref.errors import InputError
 
 #: Pixel class → its number in a class map.
-CLASSES = {"background": 0, "interior": 1, "silhouette": 2}
+CLASSES = {"background": 0, "interior": 1, "silhouette": 2, "mesostructure": 3}
 CONFIDENCE = 0.99
 
 
@@ -25,7 +25,7 @@ class Comparison:
     Parameters
     ----------
     metrics : dict of str to dict of str to float
-        Class (``interior``, ``silhouette``, ``background``, ``all``; those with pixels) → name → number.
+        Class (``interior``, ``silhouette``, ``mesostructure``, ``background``, ``all``; those with pixels) → name → number.
     gates : tuple of GateResult
         ``image.finite`` first, then those asked for.
     settings : dict
@@ -99,7 +99,7 @@ def compare(test, reference, *, classes=None, gate=None, variance=None, display=
     test, reference : path-like, (H, W, 3) array, or an object with ``image`` and perhaps ``variance``
         Linear Rec. 709. Paths are read by `load_image`.
     classes : (H, W) integer array, optional
-        0 background, 1 interior, 2 silhouette. Without it every pixel counts as interior: nothing is excused.
+        0 background, 1 interior, 2 silhouette, 3 mesostructure. Without it every pixel counts as interior: nothing is excused.
     gate : str or sequence of str, optional
         Keys of ``tolerances.toml``; ``image.finite`` is always applied.
     variance : (H, W, 3) array or pair of such, optional
@@ -194,7 +194,7 @@ def compare(test, reference, *, classes=None, gate=None, variance=None, display=
     return replace(comparison, gates=tuple(dict.fromkeys(gates)))
 
 
-def agreement(test, reference, *, gate="probe.agreement"):
+def agreement(test, reference, *, gate="probe.agreement", allowance=None):
     """Compare lists of values (probes) instead of pictures.
 
     Parameters
@@ -203,6 +203,9 @@ def agreement(test, reference, *, gate="probe.agreement"):
         Values of one shape; an entry counts by its worst channel.
     gate : str, optional
         Key of ``tolerances.toml`` with limits among p50, p99, p999, max, rmse, mae, bias and ``floor``.
+    allowance : (..., C) array, optional
+        Absolute differences that are let through: what the reference itself changes by within the stated tolerance of
+        a hit. Only what exceeds them counts.
 
     Returns
     -------
@@ -210,6 +213,10 @@ def agreement(test, reference, *, gate="probe.agreement"):
         Without maps and pictures; ``settings["worst"]`` is the flat index of the worst entry. NaN fails.
     """
     t, r = metrics.paired(test, reference)
+    if allowance is not None:
+        with np.errstate(invalid="ignore"):
+            excess = np.maximum(np.abs(t - r) - np.reshape(allowance, t.shape), 0)
+        t = r + np.copysign(excess, t - r)
     t, r = t.reshape(-1, t.shape[-1]), r.reshape(-1, r.shape[-1])
     finite = np.isfinite(t).all(-1) & np.isfinite(r).all(-1)
     bad = int(np.count_nonzero(~finite))

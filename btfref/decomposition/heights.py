@@ -117,7 +117,9 @@ def _between_layers(volume, layers, label):
     inner = np.clip(label, 1, len(layers) - 2)
     if len(layers) < 3:
         return layers[label]
-    low, middle, high = (np.take_along_axis(volume, (inner + k)[None], 0)[0].astype(float) for k in (-1, 0, 1))
+    low, middle, high = (
+        np.take_along_axis(volume, (inner + k)[None], 0)[0].astype(float) for k in (-1, 0, 1)
+    )
     bend = 2 * middle - low - high
     peak = (label == inner) & (middle >= low) & (middle >= high) & (bend > 1e-9)
     offset = np.where(peak, 0.5 * (high - low) / np.where(peak, bend, 1), 0)
@@ -150,6 +152,33 @@ def helmholtz_stereopsis(pairs, layers, progress=None):
         if progress:
             progress(number + 1, len(layers), "Helmholtz stereopsis")
     return best[1], slopes_of(best[2])
+
+
+def reciprocity_similarity(pairs, layers, progress=None):
+    """How well one normal explains all reciprocal pairs of each texel at each height, for :func:`minimum_cut`.
+
+    The reciprocity that Helmholtz stereopsis minimises texel by texel, as a volume. It needs no texture in the
+    neighbourhood, only a normal that different pairs agree on.
+
+    Parameters
+    ----------
+    pairs : btfref.decomposition.pairs.ReciprocalPairs
+    layers : ndarray, shape (n_layers,)
+    progress : callable, optional
+
+    Returns
+    -------
+    ndarray of float32, shape (n_layers, rows, columns)
+        1 minus twice the residual over its mean range: at most 1, on the scale of a correlation.
+    """
+    residual = []
+    for number, z in enumerate(layers):
+        residual.append(reciprocity_normals(pairs, z)[0])
+        if progress:
+            progress(number + 1, len(layers), "reciprocity")
+    residual = np.stack(residual)
+    spread = float(np.mean(residual.max(0) - residual.min(0)))
+    return (1 - 2 * residual / (spread if spread > 0 else 1)).astype(np.float32)
 
 
 def reciprocity_normals(pairs, z):

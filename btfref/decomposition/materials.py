@@ -18,8 +18,13 @@ N_THETA, N_PHI = 8, 32
 #: Iterations of k-means and of relaxation.
 _ITERATIONS, _RELAXATIONS = 12, 10
 
-#: A material is isotropic, and its tangents are left alone, when turning them brings texels this little nearer.
-_ISOTROPIC = 0.9
+#: Tangents of a material are left alone when turning them leaves more than this share of the squared distances, or when
+#: distributions of norm 1 differ by less than the second number (RMS) without any turn: what is left is noise.
+_ISOTROPIC, _SAME = 0.8, 0.15
+
+#: RMS distance to a common centre, of distributions of norm 1, below which all texels are one material. The separation
+#: index cannot tell: noise in one dimension, cut in two, has an index of 0.3.
+_ALIKE = 0.25
 
 
 @dataclass(frozen=True)
@@ -34,12 +39,15 @@ class Clustering:
     centres : ndarray, shape (k, N_THETA, N_PHI)
     separation : float
         RMS distance to the centres over the smallest distance between two; infinite for one material.
+    rms : float
+        RMS distance to the centres.
     """
 
     labels: np.ndarray
     rotation: np.ndarray
     centres: np.ndarray
     separation: float
+    rms: float
 
 
 def spherical_features(ndf, weight=None):
@@ -131,7 +139,7 @@ def k_means(features, count, rng):
         apart = alignment(centres, centres)[0] + np.diag(np.full(count, np.inf))
         separation = float(np.sqrt(own.mean()) / max(np.sqrt(apart.min()), 1e-12))
     rotation = shift[np.arange(len(labels)), labels] / N_PHI
-    return Clustering(labels, rotation, centres, separation)
+    return Clustering(labels, rotation, centres, separation, float(np.sqrt(own.mean())))
 
 
 def relaxed_labels(features, centres, shape):
@@ -152,9 +160,7 @@ def relaxed_labels(features, centres, shape):
     p = 1 / np.maximum(distance, 1e-6)
     p = (p / p.sum(1, keepdims=True)).reshape(*shape, -1)
     for _ in range(_RELAXATIONS):
-        around = sum(
-            np.roll(p, (y, x), (0, 1)) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)
-        )
+        around = sum(np.roll(p, (y, x), (0, 1)) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0))
         p = p * around
         p = p / np.maximum(p.sum(-1, keepdims=True), 1e-30)
     return p.reshape(len(features), -1).argmax(1)
@@ -181,7 +187,8 @@ def cluster_materials(ndf, shape, *, weight=None, largest=6, count=None, seed=0)
     clustering : Clustering
         Labels relaxed, empty materials dropped; rotation 0 in isotropic materials.
     indices : dict of int to float
-        Separation index of each number tried. One material is taken when no number brings it below 1.
+        Separation index of each number tried. One material is taken when no number brings it below 1, or when all
+        texels are alike anyway.
     """
     features = spherical_features(ndf, weight)
     rng = np.random.default_rng(seed)
@@ -192,7 +199,7 @@ def cluster_materials(ndf, shape, *, weight=None, largest=6, count=None, seed=0)
         tried[number] = min(found, key=lambda c: c.separation)
     indices = {number: c.separation for number, c in tried.items()}
     best = min(indices, key=indices.get)
-    if not count and not indices[best] < 1:
+    if not count and (tried[1].rms < _ALIKE or not indices[best] < 1):
         best = 1
     centres = tried[best].centres
     labels = relaxed_labels(features, centres, shape)
@@ -203,8 +210,8 @@ def cluster_materials(ndf, shape, *, weight=None, largest=6, count=None, seed=0)
     rotation = shift[rows, labels] / N_PHI
     for k in range(len(centres)):
         members = labels == k
-        round_centre = centres[k].mean(-1, keepdims=True)
-        plain = ((features[members] - round_centre) ** 2).sum((1, 2)).mean()
-        if distance[members, k].mean() > _ISOTROPIC * plain:
+        plain = ((features[members] - features[members].mean(0)) ** 2).sum((1, 2)).mean()
+        if distance[members, k].mean() > _ISOTROPIC * plain or plain < _SAME**2:
             rotation[members] = 0
-    return Clustering(labels.reshape(-1), rotation, centres, indices[best]), indices
+    labels = labels.reshape(-1)
+    return Clustering(labels, rotation, centres, indices[best], tried[best].rms), indices

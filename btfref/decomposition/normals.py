@@ -76,9 +76,8 @@ def helmholtz_normals(pairs, heights, progress=None):
         weight[pair] = seen[:, a] & seen[:, b] & bright
         ratio[pair] = np.log(np.maximum(values[0], pairs.black) / np.maximum(values[1], pairs.black))
     report = (lambda done, total: progress(done, total, "normals")) if progress else None
-    residual = _residual(backend(), ratio, weight, pairs.first, pairs.second)
     fitted = fit_batch(
-        residual,
+        _model(backend(), ratio, weight, pairs.first, pairs.second),
         np.zeros((n, 2), np.float32),
         [-SLOPE_LIMIT] * 2,
         [SLOPE_LIMIT] * 2,
@@ -88,8 +87,8 @@ def helmholtz_normals(pairs, heights, progress=None):
     return fitted.parameters.reshape(*shape, 2).astype(float), fitted.summary
 
 
-def _residual(module, ratio, weight, first, second):
-    """Residual and Jacobian for `fit_batch`: parameters are the slopes along u and v."""
+def _model(module, ratio, weight, first, second):
+    """Residuals and Jacobian for `fit_batch`: parameters are the slopes along u and v."""
     import drjit as dr
 
     Float = module.Float
@@ -99,24 +98,29 @@ def _residual(module, ratio, weight, first, second):
     table[:, :3], table[:, 4:7] = first, second
     table = Float(table.ravel())
 
-    def residual(p, lane, sample):
-        ax, ay, az, _ = dr.gather(module.Array4f, table, 2 * sample)
-        bx, by, bz, _ = dr.gather(module.Array4f, table, 2 * sample + 1)
-        at = dr.fma(sample, n, lane)
-        share = dr.gather(Float, mask, at)
+    def model(p, fit):
         size = dr.sqrt(1 + p[0] * p[0] + p[1] * p[1])
-        slope_terms = []
-        for x, y, z in ((ax, ay, az), (bx, by, bz)):
+
+        def facing(w):
+            """Logarithm of the cosine times ``size``, and what its derivatives are, up to their sign."""
+            x, y, z, _ = w
             cosine = z - x * p[0] - y * p[1]
             held = cosine < _FACING * size
             cosine = dr.select(held, _FACING * size, cosine)
-            slope_terms.append((dr.log(cosine), dr.select(held, 0, x / cosine), dr.select(held, 0, y / cosine)))
-        (log_a, xa, ya), (log_b, xb, yb) = slope_terms
-        # Seen from a under b: ρ (b·n); the other way round: ρ (a·n).
-        value = dr.gather(Float, data, at) - log_b + log_a
-        return share * value, [share * (xb - xa), share * (yb - ya)]
+            return dr.log(cosine), dr.select(held, 0, x / cosine), dr.select(held, 0, y / cosine)
 
-    return residual
+        def samples(step):
+            log_a, xa, ya = facing(dr.gather(module.Array4f, table, 2 * step))
+            log_b, xb, yb = facing(dr.gather(module.Array4f, table, 2 * step + 1))
+            at = dr.fma(step, n, fit)
+            share = dr.gather(Float, mask, at)
+            # Seen from a under b: ρ (b·n); the other way round: ρ (a·n).
+            value = dr.gather(Float, data, at) - log_b + log_a
+            return [(share * value, [share * (xb - xa), share * (yb - ya)])]
+
+        return samples, [Float(1), Float(1)]
+
+    return model
 
 
 def fuse(heights, slopes, depth_weight=0.2):

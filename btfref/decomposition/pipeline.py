@@ -17,6 +17,10 @@ from btfref.numerics.heightfield import HeightField
 from btfref.representations.lookup import positive_integer
 
 
+#: What heights can be told by.
+SIMILARITIES = ("reciprocity", "correlation")
+
+
 @dataclass(frozen=True)
 class Decomposition:
     """A g-BRDF and how it came about.
@@ -43,8 +47,9 @@ def decompose(
     layers=32,
     pairs=128,
     window=5,
-    smoothness=0.1,
-    depth_weight=0.2,
+    similarity="reciprocity",
+    smoothness=0.01,
+    depth_weight=0.05,
     materials=None,
     largest=6,
     ndf_size=32,
@@ -70,6 +75,10 @@ def decompose(
         Reciprocal pairs of images that take part.
     window : int
         Side of the correlation window in texels.
+    similarity : {"reciprocity", "correlation"}
+        What heights are told by: how well one normal explains all reciprocal pairs of a texel, or the paper's
+        correlation of windows (eq. 5). On the checker, whose squares have no texture inside, the heights of the latter
+        are four times as wrong.
     smoothness : float
         Of the minimum cut; see `btfref.decomposition.heights.minimum_cut`.
     depth_weight : float
@@ -103,7 +112,9 @@ def decompose(
     if materials is not None:
         positive_integer("materials", materials)
     if positive_integer("ndf_size", ndf_size) & (ndf_size - 1):
-        raise InputError("a parameter is out of range", field="ndf_size", got=ndf_size, expected="a power of two")
+        raise InputError(
+            "a parameter is out of range", field="ndf_size", got=ndf_size, expected="a power of two"
+        )
     for name, value, low, high in (
         ("depth", depth, 0.0, HEIGHT_LIMIT),
         ("depth_weight", depth_weight, 0.0, 1.0),
@@ -112,15 +123,21 @@ def decompose(
         if not (np.isfinite(value) and low < value <= high):
             expected = f"in ({max(low, 0):g}, {high:g}]"
             raise InputError("a parameter is out of range", field=name, got=value, expected=expected)
+    if similarity not in SIMILARITIES:
+        expected = " or ".join(SIMILARITIES)
+        raise InputError("a parameter is out of range", field="similarity", got=similarity, expected=expected)
     _refuse_not_finite(btf)
     report = progress or (lambda *_: None)
     shape = btf.values.shape[2:4]
     reciprocal = ReciprocalPairs(btf, pairs, seed)
     stages = {"layers": height_stage.height_layers(depth, layers)}
-    volume = height_stage.similarity(reciprocal, stages["layers"], window, report)
-    if volume is None:
+    if not len(reciprocal):
         stages["cut"] = np.zeros(shape)
     else:
+        if similarity == "correlation":
+            volume = height_stage.similarity(reciprocal, stages["layers"], window, report)
+        else:
+            volume = height_stage.reciprocity_similarity(reciprocal, stages["layers"], report)
         stages["similarity"] = volume
         report(0, 1, "minimum cut")
         stages["cut"] = height_stage.minimum_cut(volume, stages["layers"], smoothness)
@@ -134,7 +151,7 @@ def decompose(
     low, high = float(fused.min()), float(fused.max())
     unit = (fused - low) / (high - low) if high > low else np.ones(shape)
     surface_heights = HeightField((low + (high - low) * unit).astype(np.float32))
-    texels = texel_reflectance(SurfaceSamples(btf, surface_heights), progress=report)
+    texels = texel_reflectance(SurfaceSamples(btf, surface_heights, stride=2), progress=report)
     stages |= {f"texel_{name}": values for name, values in texels.items()}
     clustering, separation = cluster_materials(
         texels["ndf"], shape, largest=largest, count=materials, seed=seed
@@ -158,6 +175,7 @@ def decompose(
         "seed": seed,
         "depth": depth,
         **named,
+        "similarity": similarity,
         "smoothness": smoothness,
         "depth_weight": depth_weight,
         "materials": materials,

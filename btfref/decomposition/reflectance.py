@@ -15,7 +15,7 @@ from btfref.conventions import LUMINANCE
 from btfref.decomposition.normals import visible
 from btfref.decomposition.pairs import surface_stencil, tangent
 from btfref.numerics.microfacets import fifth_power, geometry_factor
-from btfref.numerics.parabolic import texel_solid_angles
+from btfref.numerics.parabolic import bilinear_stencil, texel_directions, texel_solid_angles
 from btfref.representations.gbrdf import surface_frame
 
 #: Texels a block: bounds the memory of their tables.
@@ -30,28 +30,33 @@ TEXEL_NDF = 16
 
 @dataclass(frozen=True)
 class Samples:
-    """What the surface points of a block of N texels show, float32; P pairs (view, light), view slowest.
+    """What the surface points of a block of N texels show; P pairs (view, light), view slowest.
+
+    Everything is multiplied by the weight: 1 / L where seen, lit and not grazing, else 0.
 
     Attributes
     ----------
-    values : ndarray, shape (N, P, 3)
+    values : ndarray of float32, shape (channels, P, N)
         B in 1/sr.
-    weight : ndarray, shape (N, P)
-        1 / L where seen, lit and not grazing, else 0.
-    cos_light, factor : ndarray, shape (N, P)
-        k1·n, and k1·n over the denominator of the BRDF.
-    cell : ndarray of int32, shape (N, P)
-        Texel of the half vector in the distribution's table.
-    fifth : ndarray, shape (P,)
-        (1 − k1·h)^5.
+    light : ndarray of float32, shape (P, N)
+        k1·n / π.
+    factor : ndarray of float32, shape (P, N)
+        k1·n over the denominator of the BRDF.
+    place : ndarray of intp, shape (P, N)
+        Flat index of the half vector's texel in the table [group, row, column] of distributions.
+    fifth : ndarray of float32, shape (P, 1)
+        (1 − k1·h)^5, without the weight.
     """
 
     values: np.ndarray
-    weight: np.ndarray
-    cos_light: np.ndarray
+    light: np.ndarray
     factor: np.ndarray
-    cell: np.ndarray
+    place: np.ndarray
     fifth: np.ndarray
+
+    def fresnel(self, r0):
+        """F(k1·h), shape (N,) -> (P, N)."""
+        return self.fifth + r0 * (1 - self.fifth)
 
 
 class SurfaceSamples:
@@ -63,66 +68,81 @@ class SurfaceSamples:
     field : btfref.numerics.heightfield.HeightField
     rotation : ndarray, shape (rows, columns), optional
         Of the tangents, in turns.
+    stride : int
+        Every so many views only.
     """
 
-    def __init__(self, btf, field, rotation=None):
+    def __init__(self, btf, field, rotation=None, stride=1):
         self._btf, self._field = btf, field
-        views, lights = btf.views.vectors, btf.lights.vectors
+        self._views = np.flatnonzero(btf.views.vectors[:, 2] > 1e-6)[::stride]
+        views, lights = btf.views.vectors[self._views], btf.lights.vectors
+        self._directions = views.astype(np.float32), lights.astype(np.float32)
         self.n_texels = int(np.prod(field.shape))
         self._seen, self._lit = visible(field, views), visible(field, lights)
-        safe = np.maximum(views[:, 2], 1e-6)
         heights = field.heights.astype(float)
-        self._stencils = [
-            surface_stencil(heights, tangent(np.array([x, y, z]))) if v[2] > 1e-6 else None
-            for v, (x, y), z in zip(views, views[:, :2], safe, strict=True)
-        ]
+        self._stencils = [surface_stencil(heights, tangent(view)) for view in views]
         turn = np.zeros(field.shape) if rotation is None else 2 * np.pi * rotation
         surface = np.concatenate([field.slopes, np.cos(turn)[..., None], np.sin(turn)[..., None]], -1)
         self._frame = np.stack(surface_frame(surface.reshape(-1, 4)), 1).astype(np.float32)
-        half = (views[:, None] + lights[None]).reshape(-1, 3)
+        half = views[:, None] + lights[None]
         half /= np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-12)
-        self._half = half.astype(np.float32)
-        self.fifth = fifth_power((half.reshape(len(views), -1, 3) * lights).sum(-1)).ravel().astype(np.float32)
-        self.black = 0.02 * mean_luminance(btf)
+        self._half = half.reshape(-1, 3).astype(np.float32)
+        self._fifth = fifth_power((half * lights).sum(-1)).reshape(-1, 1).astype(np.float32)
+        self._black = 0.02 * mean_luminance(btf)
 
     def blocks(self):
         """Texels of each block, as slices of the flat index."""
         return [slice(i, min(i + BLOCK, self.n_texels)) for i in range(0, self.n_texels, BLOCK)]
 
-    def read(self, part, ndf_size):
-        """Samples of some texels; ``cell`` is for tables of ``ndf_size`` texels a side."""
-        views, lights = (d.vectors.astype(np.float32) for d in (self._btf.views, self._btf.lights))
+    def read(self, part, size, group=None, colour=True):
+        """Samples of some texels.
+
+        Parameters
+        ----------
+        part : slice
+            Of the flat index.
+        size : int
+            Texels per side of the distributions.
+        group : ndarray of int, shape (N,), optional
+            Which distribution each texel uses; default: its own.
+        colour : bool
+            Three channels, or luminance alone.
+
+        Returns
+        -------
+        Samples
+        """
+        views, lights = self._directions
         frame = self._frame[part]
         n, n_views, n_lights = len(frame), len(views), len(lights)
-        values = np.zeros((n, n_views, n_lights, 3), np.float32)
-        for view, stencil in enumerate(self._stencils):
-            if stencil is None:
-                continue
-            index, share = stencil[0][part], stencil[1][part]
+        values = np.zeros((3, n_views, n_lights, n), np.float32)
+        for row, (view, (index, share)) in enumerate(zip(self._views, self._stencils, strict=True)):
             images = self._btf.values[view].reshape(n_lights, -1, 3)
-            for k in range(index.shape[1]):
-                values[:, view] += np.swapaxes(images[:, index[:, k]], 0, 1) * share[:, k, None, None]
-        cos_view = np.einsum("nc,vc->nv", frame[:, 2], views)
-        cos_light = np.einsum("nc,lc->nl", frame[:, 2], lights)
-        there = (self._seen[part] & (cos_view > GRAZING))[:, :, None]
-        there = there & (self._lit[part] & (cos_light > GRAZING))[:, None, :]
-        luminance = values @ LUMINANCE.astype(np.float32)
-        weight = there / np.maximum(luminance, self.black)
-        factor = geometry_factor(cos_light[:, None, :], cos_view[:, :, None]).astype(np.float32)
-        local = np.einsum("nkc,pc->knp", frame, self._half, optimize=True)
-        scale = 0.5 * ndf_size / (1 + np.maximum(local[2], 0))
+            seen = sum(
+                images[:, index[part, k]].astype(np.float32) * share[part, k, None]
+                for k in range(index.shape[1])
+            )
+            values[:, row] = np.moveaxis(seen, -1, 0)
+        values = values.reshape(3, -1, n)
+        luminance = np.tensordot(LUMINANCE.astype(np.float32), values, 1)
+        cos_view, cos_light = views @ frame[:, 2].T, lights @ frame[:, 2].T
+        there = (self._seen[part].T & (cos_view > GRAZING))[:, None]
+        there = there & (self._lit[part].T & (cos_light > GRAZING))[None]
+        x, y, z = (self._half @ frame[:, k].T for k in range(3))
+        weight = (there.reshape(-1, n) & (z > 0)) / np.maximum(luminance, np.float32(self._black))
+        scale = np.float32(0.5 * size) / (1 + np.maximum(z, 0))
         column, row = (
-            np.clip(local[i] * scale + 0.5 * ndf_size, 0, ndf_size - 1).astype(np.int32) for i in (0, 1)
+            np.clip(w * scale + np.float32(0.5 * size), 0, size - 1).astype(np.intp) for w in (x, y)
         )
-        flat = (n, n_views * n_lights)
-        light = np.broadcast_to(cos_light[:, None, :], luminance.shape)
+        group = np.arange(n) if group is None else group
+        factor = geometry_factor(cos_light[None], cos_view[:, None]).astype(np.float32).reshape(-1, n)
+        light = np.broadcast_to(cos_light[None], (n_views, n_lights, n)).reshape(-1, n)
         return Samples(
-            values.reshape(*flat, 3),
-            (weight.reshape(flat) * (local[2] > 0)).astype(np.float32),
-            light.reshape(flat),
-            factor.reshape(flat),
-            row * ndf_size + column,
-            self.fifth,
+            (values if colour else luminance[None]) * weight,
+            light * weight * np.float32(1 / np.pi),
+            factor * weight,
+            (group * size + row) * size + column,
+            self._fifth,
         )
 
 
@@ -132,57 +152,59 @@ def mean_luminance(btf):
     return float((some @ LUMINANCE.astype(np.float32)).mean()) + 1e-9
 
 
-def diffuse_colour(samples, channel, specular):
-    """c_d by eq. 9 to 11, shape (N,) in [0, 1]; ``specular`` is c_s p F k1·n / D, shape (N, P)."""
-    basis = samples.cos_light * samples.weight / np.float32(np.pi)
-    rest = (channel - specular) * samples.weight
-    return np.clip(_quotient((basis * rest).sum(1), (basis * basis).sum(1)), 0, 1)
-
-
-def distribution(samples, channel, diffuse, amount, n_cells, group=None, n_groups=None):
-    """Numerator and denominator of p by eq. 12 to 14, each of shape (n_groups, n_cells).
+def diffuse_colour(channel, samples, gloss):
+    """c_d by eq. 9 to 11, shape (N,) in [0, 1].
 
     Parameters
     ----------
+    channel : ndarray, shape (P, N)
+        One channel of ``samples.values``.
     samples : Samples
-    channel : ndarray, shape (N, P)
-    diffuse : ndarray, shape (N,)
-        c_d.
-    amount : ndarray, shape (N, P)
-        c_s F k1·n / D.
-    n_cells : int
-    group : ndarray of int, shape (N,), optional
-        Texels of one group share a distribution; default: each has its own.
-    n_groups : int, optional
+    gloss : ndarray, shape (P, N)
+        Weighted c_s p F k1·n / D.
     """
-    n = len(channel)
-    group, n_groups = (np.arange(n), n) if group is None else (group, n_groups)
-    basis = amount * samples.weight
-    rest = (channel - (diffuse / np.float32(np.pi))[:, None] * samples.cos_light) * samples.weight
-    index = (group[:, None] * n_cells + samples.cell).ravel()
-    size = n_groups * n_cells
-    return tuple(
-        np.bincount(index, (basis * other).ravel(), size).reshape(n_groups, n_cells) for other in (rest, basis)
-    )
+    return np.clip(_projection(channel - gloss, samples.light), 0, 1)
 
 
-def specular_amount(samples, channel, diffuse, p, fresnel):
-    """c_s by eq. 15 to 17, shape (N,), not yet limited; ``p`` and ``fresnel`` have shape (N, P)."""
-    basis = p * fresnel * samples.factor * samples.weight
-    rest = (channel - (diffuse / np.float32(np.pi))[:, None] * samples.cos_light) * samples.weight
-    return _quotient((basis * rest).sum(1), (basis * basis).sum(1))
+def distribution(rest, amount, samples, size):
+    """Sums over the samples of each texel of the distributions, for p by eq. 12 to 14.
+
+    Parameters
+    ----------
+    rest : ndarray, shape (P, N)
+        Weighted δ_p: what the diffuse part leaves.
+    amount : ndarray, shape (P, N)
+        Weighted λ_p = c_s F k1·n / D.
+    samples : Samples
+    size : int
+        Texels of all tables.
+
+    Returns
+    -------
+    numerator, denominator : ndarray, shape (size,)
+    """
+    place = samples.place.ravel()
+    return tuple(np.bincount(place, (amount * other).ravel(), size) for other in (rest, amount))
 
 
-def normal_reflectance(samples, channel, diffuse, shape):
-    """r0 by eq. 18 to 20, shape (N,) in [0, 1]; ``shape`` is c_s p k1·n / D, shape (N, P)."""
-    basis = shape * (1 - samples.fifth) * samples.weight
-    rest = channel - (diffuse / np.float32(np.pi))[:, None] * samples.cos_light - shape * samples.fifth
-    return np.clip(_quotient((basis * rest * samples.weight).sum(1), (basis * basis).sum(1)), 0, 1)
+def specular_amount(rest, shape):
+    """c_s by eq. 15 to 17, shape (N,), not yet limited; ``shape`` is the weighted p F k1·n / D."""
+    return _projection(rest, shape)
+
+
+def normal_reflectance(rest, shape, samples):
+    """r0 by eq. 18 to 20, shape (N,) in [0, 1]; ``shape`` is the weighted c_s p k1·n / D."""
+    return np.clip(_projection(rest - shape * samples.fifth, shape * (1 - samples.fifth)), 0, 1)
+
+
+def _projection(values, basis):
+    """Least squares factor of ``basis`` for each texel."""
+    return _quotient(np.einsum("pn,pn->n", values, basis), np.einsum("pn,pn->n", basis, basis))
 
 
 def _quotient(a, b):
     there = b > 1e-20
-    return np.where(there, a / np.where(there, b, 1), 0)
+    return np.where(there, a / np.where(there, b, 1), 0).astype(a.dtype)
 
 
 def limited_distribution(p):
@@ -227,7 +249,7 @@ def _finer(table):
     return table
 
 
-def texel_reflectance(surface, *, iterations=6, progress=None):
+def texel_reflectance(surface, *, iterations=5, progress=None):
     """Parameters of each texel on its own, in luminance: what clustering needs.
 
     Parameters
@@ -247,26 +269,24 @@ def texel_reflectance(surface, *, iterations=6, progress=None):
     result = {name: np.zeros(n) for name in ("diffuse", "specular", "fresnel")}
     result["ndf"] = np.zeros((n, size, size))
     for part in surface.blocks():
-        samples = surface.read(part, size)
-        channel = samples.values @ LUMINANCE.astype(np.float32)
-        count = len(channel)
-        rows = np.arange(count)[:, None]
-        fresnel, specular = np.full(count, 0.04, np.float32), np.ones(count, np.float32)
-        table, p = np.zeros((count, size, size)), np.float32(0)
+        samples = surface.read(part, size, colour=False)
+        channel = samples.values[0]
+        count = channel.shape[1]
+        r0, specular = np.full(count, 0.04, np.float32), np.ones(count, np.float32)
+        p = np.zeros_like(channel)
         for _ in range(iterations):
-            f = samples.fifth + fresnel[:, None] * (1 - samples.fifth)
-            base = f * samples.factor
-            diffuse = diffuse_colour(samples, channel, specular[:, None] * p * base).astype(np.float32)
-            over, under = distribution(samples, channel, diffuse, specular[:, None] * base, size * size)
+            shape = samples.fresnel(r0) * samples.factor
+            diffuse = diffuse_colour(channel, samples, specular * p * shape)
+            rest = channel - diffuse * samples.light
+            over, under = distribution(rest, specular * shape, samples, count * size * size)
             found = np.maximum(_quotient(over, under), 0).reshape(-1, size, size)
-            table = limited_distribution(push_pull(found, (under > 1e-12).reshape(found.shape).astype(float)))
-            p = table.reshape(count, -1).astype(np.float32)[rows, samples.cell]
-            specular = specular_amount(samples, channel, diffuse, p, f)
-            specular = np.clip(specular, 0, 1 - diffuse).astype(np.float32)
-            shape = specular[:, None] * p * samples.factor
-            fresnel = normal_reflectance(samples, channel, diffuse, shape).astype(np.float32)
+            known = (under > 1e-12).reshape(found.shape).astype(float)
+            table = limited_distribution(push_pull(found, known))
+            p = table.ravel().astype(np.float32)[samples.place]
+            specular = np.clip(specular_amount(rest, p * shape), 0, 1 - diffuse)
+            r0 = normal_reflectance(rest, specular * p * samples.factor, samples)
         result["diffuse"][part], result["specular"][part] = diffuse, specular
-        result["fresnel"][part], result["ndf"][part] = fresnel, table
+        result["fresnel"][part], result["ndf"][part] = r0, table
         if progress:
             progress(part.stop, n, "reflectance")
     return result
@@ -282,7 +302,7 @@ def material_reflectance(surface, labels, n_materials, *, start, size=32, iterat
     labels : ndarray of int, shape (n,)
     n_materials : int
     start : dict
-        ``ndf`` (n_materials, n, n) and ``fresnel`` (n,) to start from.
+        ``ndf`` (n_materials, k, k), ``specular`` (n_materials,) and ``fresnel`` (n,) to start from.
     size : int
         Texels per side of the distributions, a power of two.
     iterations : int
@@ -294,50 +314,44 @@ def material_reflectance(surface, labels, n_materials, *, start, size=32, iterat
         ``diffuse`` (n, 3), ``fresnel`` (n,), ``ndf`` (n_materials, size, size, 3) of largest integral 1, ``specular``
         (n_materials,): c_s.
     """
-    from btfref.numerics.parabolic import bilinear_stencil, texel_directions
-
-    n = surface.n_texels
-    solid_angle = texel_solid_angles(size)
+    n, grey = surface.n_texels, LUMINANCE.astype(np.float32)
     index, share = bilinear_stencil(texel_directions(size), start["ndf"].shape[-1])
-    grey = (start["ndf"].reshape(n_materials, -1)[:, index] * share).sum(-1)
+    first = (start["ndf"].reshape(n_materials, -1)[:, index] * share).sum(-1)
     # c_s p, the product that the data determine; it is taken apart at the end.
-    product = np.repeat(grey[..., None], 3, -1) * start["specular"][:, None, None, None]
-    diffuse, fresnel = np.zeros((n, 3)), start["fresnel"].astype(np.float32).copy()
+    product = np.repeat((first * start["specular"][:, None, None])[None], 3, 0)
+    diffuse, r0 = np.zeros((n, 3)), start["fresnel"].astype(np.float32)
     for turn in range(iterations):
-        over, under = np.zeros((2, 3, n_materials, size * size))
-        table = product.reshape(n_materials, size * size, 3).astype(np.float32)
+        sums = np.zeros((2, 3, n_materials * size * size))
+        table = product.reshape(3, -1).astype(np.float32)
         for part in surface.blocks():
-            samples = surface.read(part, size)
-            own = labels[part]
-            p = [table[own[:, None], samples.cell, c] for c in range(3)]
-            f = samples.fifth + fresnel[part][:, None] * (1 - samples.fifth)
-            channels = [samples.values[..., c] for c in range(3)]
-            for c in range(3):
-                diffuse[part, c] = diffuse_colour(samples, channels[c], p[c] * f * samples.factor)
-            grey_value = sum(k * v for k, v in zip(LUMINANCE.astype(np.float32), channels, strict=True))
-            grey_p = sum(k * v for k, v in zip(LUMINANCE.astype(np.float32), p, strict=True))
-            grey_diffuse = (diffuse[part] @ LUMINANCE).astype(np.float32)
-            r0 = normal_reflectance(samples, grey_value, grey_diffuse, grey_p * samples.factor)
+            samples = surface.read(part, size, labels[part])
+            p = table[:, samples.place]
+            shape = samples.fresnel(r0[part]) * samples.factor
+            found = [diffuse_colour(samples.values[c], samples, p[c] * shape) for c in range(3)]
+            diffuse[part] = np.stack(found, -1)
+            rest = [samples.values[c] - found[c] * samples.light for c in range(3)]
             if turn:
-                fresnel[part] = r0
-            f = samples.fifth + fresnel[part][:, None] * (1 - samples.fifth)
+                of_grey = np.tensordot(grey, p, 1) * samples.factor
+                all_rest = sum(k * r for k, r in zip(grey, rest, strict=True))
+                r0[part] = normal_reflectance(all_rest, of_grey, samples)
+                shape = samples.fresnel(r0[part]) * samples.factor
             for c in range(3):
-                found = distribution(
-                    samples,
-                    channels[c],
-                    diffuse[part, c].astype(np.float32),
-                    f * samples.factor,
-                    size * size,
-                    own,
-                    n_materials,
-                )
-                over[c] += found[0]
-                under[c] += found[1]
+                sums[:, c] += distribution(rest[c], shape, samples, sums.shape[-1])
             if progress:
                 progress(turn * n + part.stop, iterations * n, "materials' reflectance")
-        found = np.maximum(_quotient(over, under), 0).reshape(3, n_materials, size, size)
-        known = (under > 1e-3 * under.mean((-1,), keepdims=True)).reshape(found.shape)
-        product = np.moveaxis(push_pull(found, known.astype(float)), 0, -1)
-    total = (product * solid_angle[..., None]).sum((1, 2)).max(-1)
-    ndf = product / np.where(total > 0, total, 1)[:, None, None, None]
-    return {"diffuse": diffuse, "fresnel": fresnel, "ndf": ndf, "specular": np.clip(total, 0, 1)}
+        found = np.maximum(_quotient(*sums), 0).reshape(3, n_materials, size, size)
+        under = sums[1].reshape(3, n_materials, -1)
+        known = (under > 1e-3 * under.mean(-1, keepdims=True)).reshape(found.shape)
+        product = push_pull(found, known.astype(float))
+        total = (product * texel_solid_angles(size)).sum((-2, -1)).max(0)
+        # Only the product with r0 is known; what exceeds c_s = 1 and an integral of 1 is the texels' reflectance.
+        over = np.maximum(total, 1)
+        product, total = product / over[:, None, None], total / over
+        r0 = np.minimum(r0 * over[labels], 1).astype(np.float32)
+    ndf = product / np.where(total > 0, total, 1)[:, None, None]
+    return {
+        "diffuse": diffuse,
+        "fresnel": r0,
+        "ndf": np.moveaxis(ndf, 0, -1),
+        "specular": np.clip(total, 0, 1),
+    }

@@ -5,16 +5,20 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 
 from btfref.errors import InputError
+from btfref.registry import method
 from btfref.sampling.layout import refuse_existing
 
 
 def export_maps(path, out):
     """Write every map as one OpenEXR image or, beyond four channels, as one per channel.
+
+    A method whose maps are made for editing has a way of its own: ``export_maps`` in its module.
 
     Parameters
     ----------
@@ -45,7 +49,11 @@ def export_maps(path, out):
     refuse_existing(out)
     if not out.absolute().parent.is_dir():
         raise InputError("no such folder", file=out.parent)
-    arrays = load(path).arrays()
+    representation = load(path)
+    module = import_module(method(representation.meta["method"]).module)
+    if hasattr(module, "export_maps"):
+        return module.export_maps(representation, out)
+    arrays = representation.arrays()
     temporary = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.absolute().parent))
     count = 0
     try:
@@ -71,3 +79,24 @@ def export_maps(path, out):
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     return {"format": "maps", "maps": len(arrays), "images": count}
+
+
+def import_maps(folder):
+    """A representation from a folder of edited maps: that of the method which ``maps.toml`` names.
+
+    Raises
+    ------
+    InputError
+        No such file, or a method that does not take its maps back.
+    """
+    import tomllib
+
+    path = Path(folder) / "maps.toml"
+    try:
+        key = tomllib.loads(path.read_text(encoding="utf-8")).get("method")
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError("cannot read the scalars", file=path, got=error) from error
+    module = import_module(method(key, file=path).module)
+    if not hasattr(module, "import_maps"):
+        raise InputError("the method does not take its maps back", file=path, field="method", got=key)
+    return module.import_maps(folder)

@@ -220,7 +220,9 @@ class HeightField:
                 f0 = np.full(len(active), lift) if first else f0 + lift
             f1 = dz[active] - (hx + hxy * local[:, 1]) * dx - (hy + hxy * local[:, 0]) * dy
             f2 = -hxy * dx * dy
-            border = np.where(moving[active], (crossed + forward[active] - start[active]) * inverse[active], np.inf)
+            border = np.where(
+                moving[active], (crossed + forward[active] - start[active]) * inverse[active], np.inf
+            )
             leave = np.maximum(np.minimum(border.min(1), 1), s)
             q = first_root(f0, f1, f2)
             found = q <= leave - s

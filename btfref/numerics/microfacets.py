@@ -10,7 +10,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from btfref.numerics.parabolic import bilinear_stencil, solid_angle_density, square_to_hemisphere, texel_centres
+from btfref.numerics.parabolic import (
+    bilinear_stencil,
+    solid_angle_density,
+    square_to_hemisphere,
+    texel_centres,
+)
 
 #: Points per side of a texel of a distribution over which its share of the albedo is integrated.
 _FINE = 4
@@ -101,9 +106,7 @@ def _albedo_operators(n):
         factor = geometry_factor(2 * cosine * h[:, 2] - view[2], view[2])
         amount = 4 * cosine * factor * solid_angle
         for operator, values in zip(result, (amount, amount * fifth_power(cosine)), strict=True):
-            operator[row] = np.bincount(
-                texel.ravel(), (share * values[:, None]).ravel(), minlength=n * n
-            )
+            operator[row] = np.bincount(texel.ravel(), (share * values[:, None]).ravel(), minlength=n * n)
     return result
 
 

@@ -6,10 +6,10 @@ import numpy as np
 
 from btfref.render.reference import film_rays, grid_offsets, loaded
 
-BACKGROUND, INTERIOR, SILHOUETTE = 0, 1, 2
+BACKGROUND, INTERIOR, SILHOUETTE, MESOSTRUCTURE = 0, 1, 2, 3
 
 #: Names by value, for reports.
-CLASSES = ("background", "interior", "silhouette")
+CLASSES = ("background", "interior", "silhouette", "mesostructure")
 
 #: A step between neighbouring samples that leaves the tangent plane by more than this share of a pixel's
 #: footprint is an edge. A smooth surface of curvature κ leaves it by κ s²/2 (s the distance of the samples),
@@ -20,6 +20,14 @@ STEP = 0.25
 #: vertices are rounded to multiples of 1/256 pixel (Direct3D 11.3 functional specification, 3.4.1; GPUs and
 #: llvmpipe follow it).
 SNAP = 0.5 / 256
+
+#: Distance in uv, along each axis and both diagonals, within which two renderers may hit different points of a
+#: displaced surface: interpolated texture coordinates round by 1e-6 of their range, which repeats several times.
+HIT = 1e-5
+
+#: Change of the value within that distance, as a share of the largest value of the picture, that is an edge of the
+#: mesostructure (its silhouettes, borders of its shadows) and no rounding.
+EDGE = 1e-3
 
 #: Turn of the tangent frame, in radians, below which the neighbouring triangle shows the same value.
 TURN = 1e-4
@@ -33,7 +41,9 @@ def pixel_classes(scene, *, parameters=None, size=None, grid=4, variant="llvm_ad
     view passes the horizon of the shading normal, where B jumps to zero. There, two renderers may see
     different surfaces at the same sample: rasterizers snap vertices to 1/256 pixel. Hence a pixel is
     silhouette, too, when one of its samples lies that close to an edge between triangles whose tangent frames
-    differ: ∂p/∂u is constant on a triangle, so B jumps there. All other pixels that are hit are *interior*.
+    differ: ∂p/∂u is constant on a triangle, so B jumps there. *Mesostructure* are the other pixels in which a
+    material with a geometry of its own (a g-BRDF) jumps within `HIT` of a sample, under one of the scene's delta
+    lights. All other pixels that are hit are *interior*.
 
     Parameters
     ----------
@@ -49,10 +59,11 @@ def pixel_classes(scene, *, parameters=None, size=None, grid=4, variant="llvm_ad
     Returns
     -------
     ndarray of uint8, shape (H, W)
-        0 background, 1 interior, 2 silhouette.
+        0 background, 1 interior, 2 silhouette, 3 mesostructure.
     """
     with loaded(scene, parameters, variant=variant, size=size) as made:
         shape, point, normal, front, footprint, ambiguous = _hits(made, grid)
+        jumps = _displaced_edges(made, grid)
     hit = shape > 0
     edge = np.zeros(shape.shape, bool)
     for axis in (0, 1):
@@ -67,7 +78,46 @@ def pixel_classes(scene, *, parameters=None, size=None, grid=4, variant="llvm_ad
     pixels = (shape.shape[0] // grid, grid, shape.shape[1] // grid, grid)
     any_edge = _spread(edge.reshape(pixels).any((1, 3))) | ambiguous.reshape(pixels).any((1, 3))
     any_hit = hit.reshape(pixels).any((1, 3))
-    return np.where(any_edge, SILHOUETTE, np.where(any_hit, INTERIOR, BACKGROUND)).astype(np.uint8)
+    inner = np.where(jumps, MESOSTRUCTURE, INTERIOR)
+    return np.where(any_edge, SILHOUETTE, np.where(any_hit, inner, BACKGROUND)).astype(np.uint8)
+
+
+def _displaced_edges(scene, grid):
+    """Pixels with a sample where a displaced material jumps, bool (H, W), or False where there is none."""
+    import drjit as dr
+    import mitsuba as mi
+
+    if not any(is_displaced(shape.bsdf()) for shape in scene.shapes()):
+        return False
+    delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
+    lights = [light for light in scene.emitters() if int(light.flags()) & int(delta)]
+    sensor = scene.sensors()[0]
+    width, height = (int(k) for k in sensor.film().crop_size())
+    spread, largest = np.zeros((2, width * height))
+    context = mi.BSDFContext()
+    moves = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1)]
+    for offset in grid_offsets(grid):
+        ray, _ = film_rays(sensor, offset)
+        si = scene.ray_intersect(ray)
+        bsdf, uv = si.bsdf(ray), mi.Point2f(si.uv)
+        dr.eval(si)
+        for light in lights:
+            sample, power = light.sample_direction(si, mi.Point2f(0.5), si.is_valid())
+            towards, active = si.to_local(sample.d), si.is_valid() & (sample.pdf > 0)
+            values = []
+            for x, y in moves:
+                # The distances are data, not code: all moves share one kernel.
+                si.uv = uv + mi.Point2f(dr.opaque(mi.Float, HIT * x), dr.opaque(mi.Float, HIT * y))
+                value = dr.select(active, power * bsdf.eval(context, si, towards, active), 0)
+                values.append(np.array(value))
+            step = np.abs(np.stack(values[1:]) - values[0]).max((0, 1))
+            spread, largest = np.maximum(spread, step), np.maximum(largest, np.abs(values[0]).max(0))
+    return (spread > EDGE * largest.max(initial=0)).reshape(height, width)
+
+
+def is_displaced(bsdf):
+    """Whether a BSDF, or one inside of it, finds its values on a geometry of its own."""
+    return "displaced=True" in str(bsdf)
 
 
 def _part(ndim, axis, part):

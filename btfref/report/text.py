@@ -92,7 +92,11 @@ def class_table(comparison):
     str
         A ``<table>``.
     """
-    order = [name for name in ("interior", "silhouette", "background", "all") if name in comparison.metrics]
+    order = [
+        name
+        for name in ("interior", "silhouette", "mesostructure", "background", "all")
+        if name in comparison.metrics
+    ]
     epsilon = comparison.settings.get("relmse_epsilon")
     head = "".join(f'<th scope="col">{name}</th>' for name in order)
     body = []

@@ -23,8 +23,11 @@ from btfref.numerics.parabolic import bilinear_stencil
 from btfref.representations.guide import group_means, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points
 
-#: "paper": 32 layers of height, windows of 5 × 5, smoothness 0.1 and depth weight 0.2 (section 6).
-PRESETS = {"paper": {"window": 5, "smoothness": 0.1, "depth_weight": 0.2}}
+#: "paper": correlation in windows of 5 × 5 and depth weight 0.2 (section 6). The unit of the paper's smoothness, 0.1, is
+#: not given; in ours 0.1 flattens everything, 0.02 is the best for the correlation.
+PRESETS = {
+    "paper": {"similarity": "correlation", "window": 5, "smoothness": 0.02, "depth_weight": 0.2},
+}
 
 #: Tiles by which a port's hit may differ from the definition's: float32 positions at the far end of the longest ray.
 HIT_TOLERANCE = 2e-6
@@ -189,7 +192,9 @@ class Representation(StoredMaps):
         views, lights = (self.maps[f"{kind}_directions"].astype(float) for kind in ("view", "light"))
         some = lights[np.unique(np.linspace(0, len(lights) - 1, min(24, len(lights))).round().astype(int))]
         features = [
-            self._luminance(np.arange(first, min(first + _BLOCK, rows * columns)), some, np.array([[0, 0, 1.0]]))
+            self._luminance(
+                np.arange(first, min(first + _BLOCK, rows * columns)), some, np.array([[0, 0, 1.0]])
+            )
             for first in range(0, rows * columns, _BLOCK)
         ]
         labels = texel_groups(np.concatenate(features)[:, 0])
@@ -290,3 +295,17 @@ def fit(btf, *, seed=0, progress=None, **parameters):
     from btfref.decomposition.pipeline import decompose
 
     return decompose(btf, seed=seed, progress=progress, **parameters).representation
+
+
+def export_maps(representation, out):
+    """Write the maps as pictures: :func:`btfref.representations.gbrdf_maps.export_maps`."""
+    from btfref.representations import gbrdf_maps
+
+    return gbrdf_maps.export_maps(representation, out)
+
+
+def import_maps(folder):
+    """Read them back: :func:`btfref.representations.gbrdf_maps.import_maps`."""
+    from btfref.representations import gbrdf_maps
+
+    return gbrdf_maps.import_maps(folder)

@@ -14,6 +14,9 @@ from btfref.representations.lookup import direction_arrays, meta_for, stored
 #: Tiles that a height may be away from the plane z = 0, as for mesostructures.
 HEIGHT_LIMIT = 4.0
 
+#: Turns are stored in steps of 1/1530: the fully saturated hues of an 8-bit picture, so that pictures lose nothing.
+HUE_STEPS = 6 * 255
+
 #: Texels per side of a distribution's table.
 NDF_SIZE = 32
 
@@ -47,7 +50,7 @@ def from_maps(
     height_min, height_max : float
         Tile units in [−4, 4], not decreasing.
     rotation : array_like, shape (rows, columns) or ()
-        Of the tangent about the normal, in turns; wrapped to [0, 1).
+        Of the tangent about the normal, in turns; wrapped to [0, 1) and rounded to 1/1530, the steps of a hue.
     fresnel : array_like, shape (rows, columns) or ()
         r0 in [0, 1].
     material : array_like of int, shape (rows, columns) or ()
@@ -78,7 +81,9 @@ def from_maps(
         raise InputError("shape of a map", field="height", got=height.shape, expected="(rows, columns)")
     shape = height.shape
     if filter_type not in FILTER_TYPES:
-        raise InputError("unknown filter", field="filter_type", got=filter_type, expected=" or ".join(FILTER_TYPES))
+        raise InputError(
+            "unknown filter", field="filter_type", got=filter_type, expected=" or ".join(FILTER_TYPES)
+        )
     ends = [float(x) for x in (height_min, height_max)]
     if not (np.isfinite(ends).all() and -HEIGHT_LIMIT <= ends[0] <= ends[1] <= HEIGHT_LIMIT):
         expected = f"-{HEIGHT_LIMIT:g} ≤ height_min ≤ height_max ≤ {HEIGHT_LIMIT:g}"
@@ -89,36 +94,37 @@ def from_maps(
     if ndf.ndim != 4 or ndf.shape[1] != ndf.shape[2] or ndf.shape[3] != 3 or 0 in ndf.shape:
         raise InputError("shape of a map", field="ndf", got=ndf.shape, expected="(materials, n, n, 3)")
     n_materials = len(ndf)
-    material = np.broadcast_to(np.asarray(material), shape)
+    material = _broadcast("material", material, shape, None)
     if material.dtype.kind not in "iu" or material.min() < 0 or material.max() >= n_materials:
         got = f"{material.dtype} {material.min()} … {material.max()}"
         raise InputError("index map", field="material", got=got, expected=f"integers 0 … {n_materials - 1}")
-    rotation = np.broadcast_to(np.asarray(rotation, float), shape)
+    rotation = _broadcast("rotation", rotation, shape)
     if not np.isfinite(rotation).all():
         raise InputError("a map holds a value that is not finite", field="rotation")
-    # Wrapped twice: what lies just below 0 rounds to 1 in float32.
-    rotation = np.mod(np.mod(rotation, 1).astype(np.float32), np.float32(1))
+    rotation = (np.rint(np.mod(rotation, 1) * HUE_STEPS) % HUE_STEPS / HUE_STEPS).astype(np.float32)
     maps = {
         "height": _unit("height", height)[..., None].astype(np.float32),
         "rotation": rotation[..., None],
         "diffuse": stored("diffuse", _unit("diffuse", _broadcast("diffuse", diffuse, (*shape, 3))), storage),
-        "fresnel": stored("fresnel", _unit("fresnel", _broadcast("fresnel", fresnel, shape)), storage)[..., None],
+        "fresnel": stored("fresnel", _unit("fresnel", _broadcast("fresnel", fresnel, shape)), storage)[
+            ..., None
+        ],
         "material": material[..., None].astype(np.uint32),
         "ndf": stored("ndf", _unit("ndf", ndf, np.inf), storage),
-        "specular": _unit("specular", _broadcast("specular", specular, (n_materials,)))[:, None].astype(np.float32),
+        "specular": _unit("specular", _broadcast("specular", specular, (n_materials,)))[:, None].astype(
+            np.float32
+        ),
     }
     views, lights = directions(views), directions(lights)
-    meta = meta_for(
-        "gbrdf", shape, views, lights, parameters or {}, filter_type=filter_type, parent=parent
-    )
+    meta = meta_for("gbrdf", shape, views, lights, parameters or {}, filter_type=filter_type, parent=parent)
     meta["constants"] = field_constants(maps, {"height_min": ends[0], "height_max": ends[1]})
     meta["index_bytes"] = {"material": 1 if n_materials <= 256 else 2}
     return Representation(maps | direction_arrays(views, lights), meta)
 
 
-def _broadcast(name, value, shape):
+def _broadcast(name, value, shape, dtype=float):
     try:
-        return np.broadcast_to(np.asarray(value, float), shape)
+        return np.broadcast_to(np.asarray(value, dtype), shape)
     except ValueError:
         raise InputError("shape of a map", field=name, got=np.shape(value), expected=shape) from None
 
@@ -133,7 +139,9 @@ def _unit(name, values, largest=1.0):
     return values
 
 
-def from_photograph(image, *, depth=0.02, fresnel=0.04, roughness=0.3, specular=0.2, rotation=0.125, **parameters):
+def from_photograph(
+    image, *, depth=0.02, fresnel=0.04, roughness=0.3, specular=0.2, rotation=0.125, **parameters
+):
     """A g-BRDF from one picture, as the last example of the paper (section 6, figure 13).
 
     The picture becomes the diffuse map, its luminance the height, and one distribution a minor highlight.
@@ -162,7 +170,9 @@ def from_photograph(image, *, depth=0.02, fresnel=0.04, roughness=0.3, specular=
     name = None if isinstance(image, np.ndarray) else str(image)
     colours = image if name is None else np.clip(linear_colours(read_image(image)), 0, 1)
     if colours.ndim != 3 or colours.shape[-1] != 3:
-        raise InputError("shape of a picture", field="image", got=colours.shape, expected="(rows, columns, 3)")
+        raise InputError(
+            "shape of a picture", field="image", got=colours.shape, expected="(rows, columns, 3)"
+        )
     depth = number("a photograph's g-BRDF", "depth", depth, 0.0, HEIGHT_LIMIT)
     roughness = number("a photograph's g-BRDF", "roughness", roughness, 0.01, 1.0)
     grey = luminance(colours.astype(float))

@@ -14,7 +14,7 @@ from btfref.render.realtime import realtime
 from btfref.render.reference import render
 from btfref.representations import save
 
-GATES = ("image.noise_free", "image.silhouette", "image.background")
+GATES = ("image.noise_free", "image.silhouette", "image.mesostructure", "image.background")
 
 SCENES = ("plane", "sphere", "cloth")
 LIGHTS = ("directional1", "directional3", "points2")
@@ -36,6 +36,7 @@ SETTINGS = {
     "lafortune_lut": {"lobes": 2},
     "cmf": {"clusters": 32, "half_step": 10.0},
     "hf": {"clusters": 32, "smoothness": 1.0},
+    "gbrdf": {"pairs": 32, "layers": 16, "materials": 2},
 }
 
 
