@@ -8,6 +8,7 @@ import numpy as np
 
 from btfref.representations.factored import raised
 from mitsuba_plugins.lookup import HALF_SCALE, HALF_SHIFT, read_packets, wide, widened
+from mitsuba_plugins.lookup import HALF_LIMIT, HALF_SCALE, HALF_SHIFT, read_packets, wide, widened
 
 
 def half_difference(w_light, w_view):
@@ -65,13 +66,14 @@ class ParabolicMaps:
         if self.kind == dr.VarType.UInt32:
             self.values = mi.UInt32(self.values)
         elif self.kind == dr.VarType.Float16 and not dr.grad_enabled(self.values):
-            halves = values.numpy()
-            # Values are at most 1; the shift keeps subnormal halves from being flushed (see HALF_SHIFT).
+            self.kind = "halves"
+        if self.kind == "halves" and np.abs(halves := values.numpy()).max(initial=0) <= HALF_LIMIT:
+            # The shift keeps subnormal halves from being flushed (see HALF_SHIFT).
             words = (halves * np.float16(HALF_SHIFT)).view(np.uint32)
             self.values = dr.reinterpret_array(mi.Float, mi.UInt32(np.ascontiguousarray(words).ravel()))
             dr.eval(self.values)
             self.kind = "words"
-        else:
+        elif self.kind != dr.VarType.UInt32:
             self.values = wide(values)
 
     def lookup(self, slice_index, stencil, active=True):

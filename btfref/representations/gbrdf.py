@@ -32,6 +32,9 @@ PRESETS = {
 #: Tiles by which a port's hit may differ from the definition's: float32 positions at the far end of the longest ray.
 HIT_TOLERANCE = 2e-6
 
+#: Directions in which a hit is moved to find its neighbourhood.
+_MOVES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
+
 #: Members of a group of texels whose mean guides importance sampling.
 GUIDE_MEMBERS = 2
 
@@ -120,20 +123,25 @@ class Representation(StoredMaps):
         uv, w_light, w_view : array_like
             As for :meth:`evaluate`.
         tolerance : float
-            Tiles by which ``uv`` moves, in eight directions.
+            Tiles by which ``uv`` moves along both axes and diagonals, and share by which the tangents of light and view
+            change: together the rounding of a float32 march.
 
         Returns
         -------
         ndarray, shape (..., 3)
             Largest change of B in 1/sr.
         """
-        uv = np.asarray(uv, float)
+        uv, w_light, w_view = (np.asarray(a, float) for a in (uv, w_light, w_view))
         uv = np.where(np.isfinite(uv), uv, 0.0)
         here = self.evaluate(uv, w_light, w_view)
         largest = np.zeros_like(here)
-        for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1)):
-            moved = self.evaluate(uv + tolerance * np.array([x, y]), w_light, w_view)
-            largest = np.maximum(largest, np.abs(moved - here))
+        steps = [tolerance * np.array(s) for s in _MOVES]
+        steeper, flatter = (np.array([1, 1, 1 + s * tolerance]) for s in (1, -1))
+        cases = [(uv + step, w_light, w_view) for step in steps]
+        cases += [(uv, w_light * scale, w_view) for scale in (steeper, flatter)]
+        cases += [(uv, w_light, w_view * scale) for scale in (steeper, flatter)]
+        for case in cases:
+            largest = np.maximum(largest, np.abs(self.evaluate(*case) - here))
         return largest
 
     def shade(self, hit, w_light, w_view, *, lit=None):

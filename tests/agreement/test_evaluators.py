@@ -39,8 +39,9 @@ def case(request, fits):
 
 
 def assert_agrees(value, representation, points):
-    allowance = hit_allowance(representation, *points)
-    for gate in agreement(value, representation.evaluate(*points), allowance=allowance).gates:
+    reference = representation.evaluate(*points)
+    allowance = hit_allowance(representation, value, reference, points)
+    for gate in agreement(value, reference, allowance=allowance).gates:
         assert gate.passed, gate.line
 
 

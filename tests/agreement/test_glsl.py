@@ -59,8 +59,9 @@ def test_probe_agrees_with_the_definition(need, rng, fits, key, kind):
     rep = fits(key, kind)
     uv, w_light, w_view = split(points(rng, *KINDS[kind]))
     definition = rep.evaluate(uv, w_light, w_view)
-    allowance = hit_allowance(rep, uv, w_light, w_view)
-    for result in agreement(probe(rep, uv, w_light, w_view), definition, allowance=allowance).gates:
+    value = probe(rep, uv, w_light, w_view)
+    allowance = hit_allowance(rep, value, definition, (uv, w_light, w_view))
+    for result in agreement(value, definition, allowance=allowance).gates:
         assert result.passed, result.line
 
 
