@@ -43,8 +43,10 @@ def changed(rep, **changes):
         "height_min": rep.meta["constants"]["height_min"],
         "height_max": rep.meta["constants"]["height_max"],
     }
-    return from_maps(maps.pop("height") if "height" not in changes else changes.pop("height"),
-                     **{k: v for k, v in maps.items() if k != "height"} | changes)
+    return from_maps(
+        maps.pop("height") if "height" not in changes else changes.pop("height"),
+        **{k: v for k, v in maps.items() if k != "height"} | changes,
+    )
 
 
 def meso_structure(folder, cloth):
@@ -103,7 +105,9 @@ def photograph(folder):
 def picture(rep, path):
     """The shipped cloth scene, in real time."""
     save(rep, path)
-    return realtime(scene_file("cloth"), parameters={"btf": str(path), "lights": "directional3"}, size=SIZE).image
+    return realtime(
+        scene_file("cloth"), parameters={"btf": str(path), "lights": "directional3"}, size=SIZE
+    ).image
 
 
 def main(folder):
@@ -116,7 +120,9 @@ def main(folder):
     for name, group in (("before", before), ("after", after)):
         rows.append(
             [
-                np.zeros((*SIZE[::-1], 3)) if rep is None else picture(rep, folder / f"{k + 1}-{name}.gbrdf.exr")
+                np.zeros((*SIZE[::-1], 3))
+                if rep is None
+                else picture(rep, folder / f"{k + 1}-{name}.gbrdf.exr")
                 for k, rep in enumerate(group)
             ]
         )

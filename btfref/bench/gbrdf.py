@@ -1,7 +1,7 @@
 """Decomposition into a g-BRDF: time by texels, heights and normals against the truth, error beside local PCA.
 
-Menzel and Guthe 2009 report 3 hours for 256² texels, figure 6 for heights by three ways, and Table 1: RMS ΔE00 of 1.2 to
-2 times that of local PCA at a tenth of the bytes.
+Menzel and Guthe 2009 report 3 hours for 256² texels, figure 6 for heights by three ways, and Table 1: RMS ΔE00 of 1.2
+to 2 times that of local PCA at a tenth of the bytes.
 """
 
 from __future__ import annotations

@@ -16,7 +16,6 @@ from btfref.errors import InputError
 from btfref.numerics.heightfield import HeightField
 from btfref.representations.lookup import positive_integer
 
-
 #: What heights can be told by.
 SIMILARITIES = ("reciprocity", "correlation")
 
@@ -29,8 +28,8 @@ class Decomposition:
     ----------
     representation : btfref.representations.gbrdf.Representation
     stages : dict of str to ndarray
-        ``similarity`` (layers, rows, columns), ``layers``, ``cut`` and ``fused`` heights in tile units, ``slopes`` of the
-        normals, ``texel_diffuse``, ``texel_specular``, ``texel_fresnel``, ``texel_ndf`` in luminance, ``labels``,
+        ``similarity`` (layers, rows, columns), ``layers``, ``cut`` and ``fused`` heights in tile units, ``slopes`` of
+        the normals, ``texel_diffuse``, ``texel_specular``, ``texel_fresnel``, ``texel_ndf`` in luminance, ``labels``,
         ``rotation``, ``separation`` (number of materials, index).
     """
 

@@ -23,8 +23,8 @@ from btfref.numerics.parabolic import bilinear_stencil
 from btfref.representations.guide import group_means, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points
 
-#: "paper": correlation in windows of 5 × 5 and depth weight 0.2 (section 6). The unit of the paper's smoothness, 0.1, is
-#: not given; in ours 0.1 flattens everything, 0.02 is the best for the correlation.
+#: "paper": correlation in windows of 5 × 5 and depth weight 0.2 (section 6). The unit of the paper's smoothness, 0.1,
+#: is not given; in ours 0.1 flattens everything, 0.02 is the best for the correlation.
 PRESETS = {
     "paper": {"similarity": "correlation", "window": 5, "smoothness": 0.02, "depth_weight": 0.2},
 }
@@ -50,8 +50,8 @@ class Representation(StoredMaps):
 
     ``height`` [r, c, 1] in [0, 1] between the constants ``height_min`` and ``height_max`` (tile units); ``rotation``
     [r, c, 1] of the tangent in turns; ``diffuse`` [r, c, 3] c_d; ``fresnel`` [r, c, 1] r0; ``material`` [r, c, 1]
-    uint32; ``ndf`` [material, n, n, 3] parabolic tables of p; ``specular`` [material, 1] c_s; and direction tables, which
-    only guide sampling.
+    uint32; ``ndf`` [material, n, n, 3] parabolic tables of p; ``specular`` [material, 1] c_s; and direction tables,
+    which only guide sampling.
     """
 
     @classmethod
