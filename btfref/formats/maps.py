@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 
@@ -45,20 +46,13 @@ def export_maps(path, out):
     from btfref.formats.pictures import write_exr
     from btfref.representations.container import image_size, load
 
-    out = Path(out)
-    refuse_existing(out)
-    if not out.absolute().parent.is_dir():
-        raise InputError("no such folder", file=out.parent)
     representation = load(path)
     module = import_module(method(representation.meta["method"]).module)
     if hasattr(module, "export_maps"):
         return module.export_maps(representation, out)
     arrays = representation.arrays()
-    temporary = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.absolute().parent))
     count = 0
-    try:
-        folder = temporary / "maps"
-        folder.mkdir()
+    with new_folder(out) as folder:
         for name, array in arrays.items():
             array = np.asarray(array)
             image = array.reshape(*image_size(array.shape), array.shape[-1]).astype(np.float32)
@@ -75,10 +69,30 @@ def export_maps(path, out):
                     np.float32,
                 )
                 count += 1
+    return {"format": "maps", "maps": len(arrays), "images": count}
+
+
+@contextmanager
+def new_folder(out):
+    """A folder to fill, which gets its name ``out`` when all is written; nothing is left behind otherwise.
+
+    Raises
+    ------
+    InputError
+        An existing path, or no folder to make it in.
+    """
+    out = Path(out)
+    refuse_existing(out)
+    if not out.absolute().parent.is_dir():
+        raise InputError("no such folder", file=out.parent)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.absolute().parent))
+    try:
+        folder = temporary / "maps"
+        folder.mkdir()
+        yield folder
         os.replace(folder, out)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-    return {"format": "maps", "maps": len(arrays), "images": count}
 
 
 def import_maps(folder):

@@ -1,9 +1,9 @@
 """Rays through a periodic height field of bilinear patches: exact hits, no fixed steps.
 
 Heights stand at texel centres (i + ½)/n; between four of them the surface is the bilinear patch. A ray of direction
-w through (u, v) on the plane z = 0 is at ``uv + z w_xy / w_z`` at height z. It is followed from the top of the field to its
-bottom, cell by cell; in a cell the height above the surface is a quadratic in the ray's parameter, whose first root is
-the hit. Source of the idea: parallax occlusion mapping (N. Tatarchuk, "Dynamic Parallax Occlusion Mapping with
+w through (u, v) on the plane z = 0 is at ``uv + z w_xy / w_z`` at height z. It is followed from the top of the field to
+its bottom, cell by cell; in a cell the height above the surface is a quadratic in the ray's parameter, whose first root
+is the hit. Source of the idea: parallax occlusion mapping (N. Tatarchuk, "Dynamic Parallax Occlusion Mapping with
 Approximate Soft Shadows", 2006), whose linear search and refinement the quadratic replaces. The ports are
 :mod:`mitsuba_plugins.heightfield` and ``shaders/lib/heightfield.glsl``.
 """

@@ -9,9 +9,6 @@ or an OpenEXR file of the same stem: PNG colours are sRGB, other PNG numbers are
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import tempfile
 import tomllib
 from pathlib import Path
 
@@ -75,22 +72,15 @@ def export_maps(representation, out):
     """
     from PIL import Image
 
+    from btfref.formats.maps import new_folder
     from btfref.formats.pictures import write_exr
-    from btfref.sampling.layout import refuse_existing
 
-    out = Path(out)
-    refuse_existing(out)
-    if not out.absolute().parent.is_dir():
-        raise InputError("no such folder", file=out.parent)
     maps, meta = representation.maps, representation.meta
     if len(maps["ndf"]) > 256:
         raise InputError(
             "too many materials for a palette", field="ndf", got=len(maps["ndf"]), expected="≤ 256"
         )
-    temporary = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.absolute().parent))
-    try:
-        folder = temporary / "maps"
-        folder.mkdir()
+    with new_folder(out) as folder:
 
         def exr(stem, image):
             planes = dict(zip("Y" if image.shape[-1] == 1 else "RGB", np.moveaxis(image, -1, 0), strict=True))
@@ -105,9 +95,6 @@ def export_maps(representation, out):
         picture.putpalette([x for k in range(256) for x in PALETTE[k % len(PALETTE)]])
         picture.save(folder / "material.png")
         (folder / SCALARS).write_text(_scalars(maps, meta), encoding="utf-8")
-        os.replace(folder, out)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
     return {"format": "maps", "maps": 6, "images": 5 + len(maps["ndf"])}
 
 
