@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from btfref.representations.gbrdf import ROTATION_FLOOR
 from mitsuba_plugins.heightfield import HeightField
 from mitsuba_plugins.lookup import wide
 from mitsuba_plugins.parabolic import ParabolicMaps, bilinear_stencil
@@ -85,7 +86,7 @@ class Evaluator:
         u = dr.normalize(mi.Vector3f(dr.fma(sy, sy, 1), -sx * sy, sx))
         v = dr.cross(normal, u)
         length = dr.sqrt(dr.fma(c, c, s * s))
-        there = length > 0
+        there = length > ROTATION_FLOOR
         scale = 1 / dr.select(there, length, 1)
         c, s = dr.select(there, c * scale, 1), dr.select(there, s * scale, 0)
         return c * u + s * v, c * v - s * u, normal

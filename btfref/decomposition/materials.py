@@ -20,7 +20,7 @@ _ITERATIONS, _RELAXATIONS = 12, 10
 
 #: Tangents of a material are left alone when turning them leaves more than this share of the squared distances, or when
 #: distributions of norm 1 differ by less than the second number (RMS) without any turn: what is left is noise.
-_ISOTROPIC, _SAME = 0.8, 0.15
+_ISOTROPIC, _SAME = 0.5, 0.15
 
 #: RMS distance to a common centre, of distributions of norm 1, below which all texels are one material. The separation
 #: index cannot tell: noise in one dimension, cut in two, has an index of 0.3.

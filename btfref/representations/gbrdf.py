@@ -32,6 +32,10 @@ PRESETS = {
 #: Tiles by which a port's hit may differ from the definition's: float32 positions at the far end of the longest ray.
 HIT_TOLERANCE = 2e-6
 
+#: Length of interpolated cosine and sine below which tangents of all directions meet: there is no turn to speak of, and
+#: float32 would make one up (its rounding of 6e-8 turns a tangent by 6e-6 at this length).
+ROTATION_FLOOR = 0.01
+
 #: Directions in which a hit is moved to find its neighbourhood.
 _MOVES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
 
@@ -277,7 +281,8 @@ def surface_frame(surface):
     Parameters
     ----------
     surface : ndarray, shape (N, 4)
-        Slopes along u and v, cosine and sine of the rotation (of any length; zero counts as no rotation).
+        Slopes along u and v, cosine and sine of the rotation (of any length; below :data:`ROTATION_FLOOR` they count as
+        no rotation).
 
     Returns
     -------
@@ -292,7 +297,7 @@ def surface_frame(surface):
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
     v = np.cross(normal, u)
     length = np.hypot(cosine, sine)
-    there = length > 0
+    there = length > ROTATION_FLOOR
     c = np.where(there, cosine / np.where(there, length, 1), 1)[:, None]
     s = np.where(there, sine / np.where(there, length, 1), 0)[:, None]
     return c * u + s * v, c * v - s * u, normal

@@ -34,8 +34,9 @@ mat3 surface_frame(vec4 s) {
     // (1 - nx^2, -nx ny, -nx nz) up to its length, with the cancellation taken out.
     vec3 u = normalize(vec3(1.0 + s.y * s.y, -s.x * s.y, s.x));
     vec3 v = cross(normal, u);
+    // Below 0.01 tangents of all directions meet, and rounding would make a turn up.
     float size = length(s.zw);
-    vec2 turn = size > 0.0 ? s.zw / size : vec2(1.0, 0.0);
+    vec2 turn = size > 0.01 ? s.zw / size : vec2(1.0, 0.0);
     return transpose(mat3(turn.x * u + turn.y * v, turn.x * v - turn.y * u, normal));
 }
 
