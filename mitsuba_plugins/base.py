@@ -169,22 +169,27 @@ def make_bsdf():
         def _enabled(ctx):
             return ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
 
-        def _hit(self, uv, w_view, active):
-            """What the evaluator can say about the view alone, and where sampling looks its tables up.
+        def _view(self, si, w_view, active):
+            """What is known of the view alone: arguments of the evaluator, and tables of the guide.
 
-            An evaluator with geometry finds the point that the view sees; others stay at ``uv``.
+            An evaluator with geometry finds the point that the view sees, and the guide looks its tables up there;
+            others stay at ``uv``.
             """
-            if not hasattr(self.evaluator, "hit"):
-                return {}, uv
-            hit, surface_uv = self.evaluator.hit(uv, w_view, active)
-            return {"hit": hit}, surface_uv
+            uv = self._uv(si)
+            known = {} if self.detail is None else self.detail(si)
+            place = uv
+            if hasattr(self.evaluator, "hit"):
+                hit, place = self.evaluator.hit(uv, w_view, active)
+                known = known | {"hit": hit}
+            return known, self.guide.neighbours(place, w_view, known.get("lod"))
 
-        def _value(self, ctx, uv, w_light, w_view, active, known):
+        def _value(self, ctx, si, w_light, w_view, active, known=None):
             if ctx.mode == mi.TransportMode.Importance:
                 # The view's hit is of no use where the roles are swapped.
-                value = self.evaluator.evaluate(uv, w_view, w_light, active)
-            else:
-                value = self.evaluator.evaluate(uv, w_light, w_view, active, **known)
+                w_view, w_light, known = w_light, w_view, None
+            if known is None:
+                known = {} if self.detail is None else self.detail(si)
+            value = self.evaluator.evaluate(self._uv(si), w_light, w_view, active, **known)
             return dr.select(active, value * self.scale, 0)
 
         def _directions(self, si, wo, active):
@@ -195,42 +200,23 @@ def make_bsdf():
         def eval(self, ctx, si, wo, active=True):
             if not self._enabled(ctx):
                 return mi.Color3f(0)
-            w_view, view_valid = self._local(si.wi)
-            w_light, light_valid = self._local(wo)
-            active = mi.Bool(active) & view_valid & light_valid
-            if ctx.mode == mi.TransportMode.Importance:
-                w_view, w_light = w_light, w_view
-            detail = {} if self.detail is None else self.detail(si)
-            value = self.evaluator.evaluate(self._uv(si), w_light, w_view, active, **detail)
-            return dr.select(active, value * self.scale, 0)
             w_view, w_light, active = self._directions(si, wo, active)
-            return self._value(ctx, self._uv(si), w_light, w_view, active, {})
+            return self._value(ctx, si, w_light, w_view, active)
 
         def pdf(self, ctx, si, wo, active=True):
             if not self._enabled(ctx):
                 return mi.Float(0)
             # The sampled direction always plays the light: a guide for importance transport is not worth its memory.
-            w_view, view_valid = self._local(si.wi)
-            w_light, light_valid = self._local(wo)
-            active = mi.Bool(active) & view_valid & light_valid
-            return self.guide.pdf(self._tables(si, w_view), w_light, active)
-
-        def _tables(self, si, w_view):
-            """Tables of the guide, at the interaction's level of detail."""
-            lod = None if self.detail is None else self.detail(si)["lod"]
-            return self.guide.neighbours(self._uv(si), w_view, lod)
             w_view, w_light, active = self._directions(si, wo, active)
-            _, place = self._hit(self._uv(si), w_view, active)
-            return self.guide.pdf(self.guide.neighbours(place, w_view), w_light, active)
+            return self.guide.pdf(self._view(si, w_view, active)[1], w_light, active)
 
         def eval_pdf(self, ctx, si, wo, active=True):
             if not self._enabled(ctx):
                 return mi.Color3f(0), mi.Float(0)
             w_view, w_light, active = self._directions(si, wo, active)
-            uv = self._uv(si)
-            known, place = self._hit(uv, w_view, active)
-            value = self._value(ctx, uv, w_light, w_view, active, known)
-            return value, self.guide.pdf(self.guide.neighbours(place, w_view), w_light, active)
+            known, tables = self._view(si, w_view, active)
+            value = self._value(ctx, si, w_light, w_view, active, known)
+            return value, self.guide.pdf(tables, w_light, active)
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             bs = dr.zeros(mi.BSDFSample3f)
@@ -238,19 +224,15 @@ def make_bsdf():
                 return bs, mi.Color3f(0)
             w_view, view_valid = self._local(si.wi)
             active = mi.Bool(active) & view_valid
-            w_light = self.guide.sample(self._tables(si, w_view), sample1, sample2)
-            uv = self._uv(si)
-            known, place = self._hit(uv, w_view, active)
-            neighbours = self.guide.neighbours(place, w_view)
-            w_light = self.guide.sample(neighbours, sample1, sample2)
-            bs.wo = self._turn(w_light, -1)
+            known, tables = self._view(si, w_view, active)
+            bs.wo = self._turn(self.guide.sample(tables, sample1, sample2), -1)
             bs.eta = 1.0
             bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
             bs.sampled_component = 0
             w_light, light_valid = self._local(bs.wo)
             active &= light_valid
-            value = self._value(ctx, uv, w_light, w_view, active, known)
-            bs.pdf = self.guide.pdf(neighbours, w_light, active)
+            value = self._value(ctx, si, w_light, w_view, active, known)
+            bs.pdf = self.guide.pdf(tables, w_light, active)
             usable = active & (bs.pdf > 0)
             return bs, dr.select(usable, value / bs.pdf, 0)
 

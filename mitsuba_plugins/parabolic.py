@@ -7,7 +7,6 @@ import mitsuba as mi
 import numpy as np
 
 from btfref.representations.factored import raised
-from mitsuba_plugins.lookup import HALF_SCALE, HALF_SHIFT, read_packets, wide, widened
 from mitsuba_plugins.lookup import HALF_LIMIT, HALF_SCALE, HALF_SHIFT, read_packets, wide, widened
 
 
