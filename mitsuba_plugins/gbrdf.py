@@ -24,7 +24,7 @@ class Evaluator:
         tensors = maps.tensors
         self.field = HeightField(tensors["cells"].array, self.shape, self.constants)
         self.surface, self.gloss = wide(tensors["surface"]), wide(tensors["gloss"])
-        self.colour, self.ndf = wide(tensors["colour"]), ParabolicMaps(tensors["ndf"])
+        self.colour, self.ndf = wide(tensors["colour"]), ParabolicMaps(tensors["ndf"], 1)
 
     def hit(self, uv, w_view, active):
         """The point that a view ray hits, for :meth:`evaluate`, and its texture coordinates, for sampling."""

@@ -72,7 +72,7 @@ vec3 btf_eval(vec2 uv, vec3 w_light, vec3 w_view, float lod) {
         vec2 kind = table_fetch(gloss, texels.index[x]).xy;
         diffuse += texels.weight[x] * own.rgb;
         float share = texels.weight[x] * kind.y * (own.a + (1.0 - own.a) * fifth);
-        specular += share * parabolic_lookup(ndf, int(kind.x), NDF_DIM1, half_stencil);
+        specular += share * parabolic_lookup(ndf, int(kind.x), NDF_DIM1, half_stencil, 1);
     }
     // 0.318... = 1/pi
     return light * 0.3183098861837907 * diffuse + factor * specular;
