@@ -41,13 +41,13 @@ class Evaluator:
         active = active & (cos_light > 0)
         active &= self.field.lit(cell, local, height, w_light, active)
         h = w_light + w_view
-        length = dr.norm(h)
-        h = dr.select(length > 0, h / length, mi.Vector3f(0, 0, 1))
+        length = dr.sqrt(dr.squared_norm(h))
+        # Tables are looked up with any length: a normalisation less is a rounding less near the horizon.
         facet = mi.Vector3f(dr.dot(h, tangent), dr.dot(h, bitangent), dr.dot(h, normal))
         light, view = dr.maximum(cos_light, 0), dr.maximum(dr.dot(w_view, normal), 0)
         factor = light / dr.maximum(dr.fma(-light, view, light + view), 1e-30)
         factor = dr.select(facet.z > 0, factor, 0)
-        grazing = 1 - dr.clip(dr.dot(w_light, h), 0, 1)
+        grazing = 1 - dr.clip(dr.dot(w_light, h) / dr.maximum(length, 1e-30), 0, 1)
         fifth = dr.square(dr.square(grazing)) * grazing
         stencil = bilinear_stencil(facet, self.ndf.n)
         diffuse, gloss = mi.Color3f(0), mi.Color3f(0)
@@ -82,11 +82,16 @@ class Evaluator:
         for texel, weight in texels:
             total = dr.fma(dr.gather(mi.Vector4f, self.surface, texel, active), weight, total)
         sx, sy, c, s = total
-        normal = dr.normalize(mi.Vector3f(-sx, -sy, 1))
-        u = dr.normalize(mi.Vector3f(dr.fma(sy, sy, 1), -sx * sy, sx))
+        normal = _unit(mi.Vector3f(-sx, -sy, 1))
+        u = _unit(mi.Vector3f(dr.fma(sy, sy, 1), -sx * sy, sx))
         v = dr.cross(normal, u)
         length = dr.sqrt(dr.fma(c, c, s * s))
         there = length > ROTATION_FLOOR
         scale = 1 / dr.select(there, length, 1)
         c, s = dr.select(there, c * scale, 1), dr.select(there, s * scale, 0)
         return c * u + s * v, c * v - s * u, normal
+
+
+def _unit(v):
+    """``v`` over its length by a square root and a division; ``dr.normalize`` takes an approximate reciprocal root."""
+    return v / dr.sqrt(dr.squared_norm(v))

@@ -89,9 +89,11 @@ class ParabolicMaps:
         total = [mi.Float(0)] * 3
         for index, weight in zip(*stencil, strict=True):
             colour, factor = self._texel(first + index, active)
-            colour, factor = [raised(c, self.power) for c in colour], factor**self.power
+            colour = [raised(c, self.power) for c in colour]
+            # The weight takes the factor: halves widened without it are so small that their products would be flushed.
+            weight = weight * factor**self.power
             total = [dr.fma(c, weight, t) for c, t in zip(colour, total, strict=True)]
-        return mi.Color3f(*total) * factor
+        return mi.Color3f(*total)
 
     def _texel(self, texel, active):
         """Three channels, and the factor that makes values of them."""
