@@ -92,13 +92,13 @@ FieldMarch field_march(ivec2 cell, vec2 start, vec2 travel, float z0, float dz, 
 FieldHit field_view_hit(vec2 uv, vec3 w) {
     vec2 size = vec2(float(CELLS_DIM1), float(CELLS_DIM0));
     vec2 tangent = field_tangent(w);
-    vec2 x = texel_position(uv.x, size.x, 0.5);
-    vec2 y = texel_position(uv.y, size.y, 0.5);
-    vec2 start = vec2(x.y, y.y) + tangent * size * float(TOP);
+    vec2 corner, start;
+    texel_corner(uv, CELLS_DIM0, CELLS_DIM1, corner, start);
+    start += tangent * size * float(TOP);
     vec2 whole = floor(start);
     start -= whole;
     FieldHit hit;
-    hit.cell = field_wrapped(vec2(x.x, y.x) + whole);
+    hit.cell = field_wrapped(corner + whole);
     vec2 travel = tangent * size * -FIELD_DEPTH;
     FieldMarch march = field_march(hit.cell, start, travel, float(TOP), -FIELD_DEPTH, -1.0);
     hit.local = clamp(start - march.crossed + min(march.s, 1.0) * travel, 0.0, 1.0);

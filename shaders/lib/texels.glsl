@@ -1,4 +1,4 @@
-// Provides texel_stencil: the texels that a lookup blends, as flat indices row * columns + column, and weights.
+// Provides texel_stencil (texels that a lookup blends: flat indices row * columns + column, weights) and texel_corner.
 // Expects FILTER_BILINEAR (1: the four neighbours, 0: the texel that holds uv).
 
 #include "lib/stencil.glsl"
@@ -18,19 +18,27 @@ vec2 texel_position(float u, float n, float shift) {
     return vec2(whole + carry, fraction - carry);
 }
 
-// Texel centres are at (i + 1/2)/n, the texture repeats.
-Stencil texel_stencil(vec2 uv, int rows, int columns) {
-#if FILTER_BILINEAR
+// Texel centres are at (i + 1/2)/n: column and row of the last centre before uv, and the way from there to the next.
+void texel_corner(vec2 uv, int rows, int columns, out vec2 corner, out vec2 way) {
     vec2 x = texel_position(uv.x, float(columns), 0.5);
     vec2 y = texel_position(uv.y, float(rows), 0.5);
-    int c0 = int(x.x), r0 = int(y.x);
+    corner = vec2(x.x, y.x);
+    way = vec2(x.y, y.y);
+}
+
+// The texture repeats.
+Stencil texel_stencil(vec2 uv, int rows, int columns) {
+#if FILTER_BILINEAR
+    vec2 corner, f;
+    texel_corner(uv, rows, columns, corner, f);
+    int c0 = int(corner.x), r0 = int(corner.y);
     c0 = c0 < 0 ? c0 + columns : min(c0, columns - 1);
     r0 = r0 < 0 ? r0 + rows : min(r0, rows - 1);
     int c1 = c0 + 1 == columns ? 0 : c0 + 1;
     int r1 = r0 + 1 == rows ? 0 : r0 + 1;
     return Stencil(
         ivec4(r0 * columns + c0, r0 * columns + c1, r1 * columns + c0, r1 * columns + c1),
-        vec4((1.0 - x.y) * (1.0 - y.y), x.y * (1.0 - y.y), (1.0 - x.y) * y.y, x.y * y.y));
+        vec4((1.0 - f.x) * (1.0 - f.y), f.x * (1.0 - f.y), (1.0 - f.x) * f.y, f.x * f.y));
 #else
     // A coordinate just below an integer may round up to it.
     int c = min(int(texel_position(uv.x, float(columns), 0.0).x), columns - 1);

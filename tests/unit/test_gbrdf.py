@@ -145,7 +145,15 @@ EXTREMES = {
 
 
 @pytest.mark.parametrize("name", EXTREMES)
-def test_extremes_are_finite_and_agree(name, rng, need, llvm, tmp_path):
+def test_extremes_are_finite(name, rng):
+    sets = directions("ubo81")
+    value = edited(rng, **EXTREMES[name]).evaluate(*probe_points(rng, 4000, sets, sets))
+    assert np.isfinite(value).all()
+    assert (value >= 0).all()
+
+
+@pytest.mark.parametrize("name", ["extreme height", "spikes", "largest half"])
+def test_extremes_agree(name, rng, need, llvm, tmp_path):
     """Grazing lights and views among them, in all three evaluators."""
     import drjit as dr
 
@@ -160,8 +168,6 @@ def test_extremes_are_finite_and_agree(name, rng, need, llvm, tmp_path):
     sets = directions("ubo81")
     points = probe_points(rng, 4000, sets, sets)
     value = rep.evaluate(*points)
-    assert np.isfinite(value).all()
-    assert (value >= 0).all()
     save(rep, tmp_path / "x.gbrdf.exr")
     plugin = mi.load_dict({"type": "btf", "filename": str(tmp_path / "x.gbrdf.exr")})
     si = dr.zeros(mi.SurfaceInteraction3f, 4000)
