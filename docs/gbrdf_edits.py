@@ -19,7 +19,7 @@ from btfref.representations.gbrdf_geometry import from_mesostructure
 from btfref.representations.gbrdf_maps import export_maps, hue_of_turns, import_maps, turns_of_hue
 from btfref.scenes import scene_file
 
-SIZE = (256, 256)
+SIZE = (192, 192)
 
 
 def logo(shape):
@@ -62,7 +62,7 @@ def meso_structure(folder, cloth):
 
 def colour(cloth):
     """2. Colour channels exchanged in diffuse map and distributions; light pink lint at grazing half vectors."""
-    swap = [1, 0, 2]
+    swap = [2, 1, 0]
     z = texel_directions(cloth.maps["ndf"].shape[1])[..., 2]
     lint = np.clip(1 - z / 0.5, 0, 1)[..., None] ** 2 * [0.5, 0.3, 0.35]
     return changed(cloth, diffuse=cloth.maps["diffuse"][..., swap], ndf=cloth.maps["ndf"][..., swap] + lint)
@@ -106,7 +106,7 @@ def picture(rep, path):
     """The shipped cloth scene, in real time."""
     save(rep, path)
     return realtime(
-        scene_file("cloth"), parameters={"btf": str(path), "lights": "directional3"}, size=SIZE
+        scene_file("cloth"), parameters={"btf": str(path), "lights": "directional3", "tiling": "3"}, size=SIZE
     ).image
 
 

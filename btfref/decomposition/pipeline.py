@@ -158,17 +158,9 @@ def decompose(
     labels, n_materials = clustering.labels, len(clustering.centres)
     stages["labels"], stages["rotation"] = labels.reshape(shape), clustering.rotation.reshape(shape)
     stages["separation"] = np.array(list(separation.items()))
-    share = np.zeros((n_materials, len(labels)))
-    share[labels, np.arange(len(labels))] = 1
-    share /= share.sum(1, keepdims=True)
-    start = {
-        "ndf": np.tensordot(share, texels["ndf"], 1),
-        "specular": share @ texels["specular"],
-        "fresnel": (share @ texels["fresnel"])[labels],
-    }
     surface = SurfaceSamples(btf, surface_heights, stages["rotation"])
     found = material_reflectance(
-        surface, labels, n_materials, start=start, size=ndf_size, iterations=iterations, progress=report
+        surface, labels, n_materials, size=ndf_size, iterations=iterations, progress=report
     )
     parameters = {
         "seed": seed,

@@ -15,7 +15,7 @@ from btfref.conventions import LUMINANCE
 from btfref.decomposition.normals import visible
 from btfref.decomposition.pairs import surface_stencil, tangent
 from btfref.numerics.microfacets import fifth_power, geometry_factor
-from btfref.numerics.parabolic import bilinear_stencil, texel_directions, texel_solid_angles
+from btfref.numerics.parabolic import texel_solid_angles
 from btfref.representations.gbrdf import surface_frame
 
 #: Texels a block: bounds the memory of their tables.
@@ -23,6 +23,13 @@ BLOCK = 128
 
 #: Cosines to the local normal below which a sample is left out: there the height map decides, not the material.
 GRAZING = 0.1
+
+#: Share of a texel's mean luminance at which the weight 1 / L ends: borders of shadows that the heights miss by a texel
+#: are dark samples of lit points, and would count hundreds of times.
+FLOOR = 0.3
+
+#: r0 to start from: a refractive index of 1.5.
+FIRST_FRESNEL = 0.04
 
 #: Texels per side of the table of a single texel's distribution.
 TEXEL_NDF = 16
@@ -129,7 +136,9 @@ class SurfaceSamples:
         there = (self._seen[part].T & (cos_view > GRAZING))[:, None]
         there = there & (self._lit[part].T & (cos_light > GRAZING))[None]
         x, y, z = (self._half @ frame[:, k].T for k in range(3))
-        weight = (there.reshape(-1, n) & (z > 0)) / np.maximum(luminance, np.float32(self._black))
+        there = there.reshape(-1, n) & (z > 0)
+        mean = np.einsum("pn,pn->n", luminance, there) / np.maximum(there.sum(0), 1)
+        weight = there / np.maximum(luminance, np.maximum(np.float32(FLOOR) * mean, np.float32(self._black)))
         scale = np.float32(0.5 * size) / (1 + np.maximum(z, 0))
         column, row = (
             np.clip(w * scale + np.float32(0.5 * size), 0, size - 1).astype(np.intp) for w in (x, y)
@@ -272,7 +281,7 @@ def texel_reflectance(surface, *, iterations=5, progress=None):
         samples = surface.read(part, size, colour=False)
         channel = samples.values[0]
         count = channel.shape[1]
-        r0, specular = np.full(count, 0.04, np.float32), np.ones(count, np.float32)
+        r0, specular = np.full(count, FIRST_FRESNEL, np.float32), np.ones(count, np.float32)
         p = np.zeros_like(channel)
         for _ in range(iterations):
             shape = samples.fresnel(r0) * samples.factor
@@ -292,8 +301,10 @@ def texel_reflectance(surface, *, iterations=5, progress=None):
     return result
 
 
-def material_reflectance(surface, labels, n_materials, *, start, size=32, iterations=4, progress=None):
+def material_reflectance(surface, labels, n_materials, *, size=32, iterations=4, progress=None):
     """Distributions of the materials, and c_d and r0 of the texels, in colour.
+
+    Starts with c_d alone, as the paper does: a distribution that is there first would keep what is diffuse.
 
     Parameters
     ----------
@@ -301,8 +312,6 @@ def material_reflectance(surface, labels, n_materials, *, start, size=32, iterat
         With the rotation of the tangents.
     labels : ndarray of int, shape (n,)
     n_materials : int
-    start : dict
-        ``ndf`` (n_materials, k, k), ``specular`` (n_materials,) and ``fresnel`` (n,) to start from.
     size : int
         Texels per side of the distributions, a power of two.
     iterations : int
@@ -315,11 +324,9 @@ def material_reflectance(surface, labels, n_materials, *, start, size=32, iterat
         (n_materials,): c_s.
     """
     n, grey = surface.n_texels, LUMINANCE.astype(np.float32)
-    index, share = bilinear_stencil(texel_directions(size), start["ndf"].shape[-1])
-    first = (start["ndf"].reshape(n_materials, -1)[:, index] * share).sum(-1)
     # c_s p, the product that the data determine; it is taken apart at the end.
-    product = np.repeat((first * start["specular"][:, None, None])[None], 3, 0)
-    diffuse, r0 = np.zeros((n, 3)), start["fresnel"].astype(np.float32)
+    product = np.zeros((3, n_materials, size, size))
+    diffuse, r0 = np.zeros((n, 3)), np.full(n, FIRST_FRESNEL, np.float32)
     for turn in range(iterations):
         sums = np.zeros((2, 3, n_materials * size * size))
         table = product.reshape(3, -1).astype(np.float32)

@@ -139,20 +139,14 @@ def _seen_from_above(made, texels):
 
 def _material(bsdf, part, uv, ndf_size):
     """Parameters of a part's BSDF: those of a flat BTF made of it, a column of texels."""
-    from btfref.decomposition.reflectance import SurfaceSamples, material_reflectance, texel_reflectance
+    from btfref.decomposition.reflectance import SurfaceSamples, material_reflectance
 
     textured = bool(part.textures)
     uv = uv if textured and len(uv) else np.full((1, 2), 0.5)
     flat = _flat_btf(bsdf, uv, directions(_TEXTURED_DIRECTIONS if textured else _DIRECTIONS))
     surface = SurfaceSamples(flat, HeightField(np.zeros((len(uv), 1), np.float32)))
-    start = texel_reflectance(surface)
-    mean = {
-        "ndf": start["ndf"].mean(0)[None],
-        "specular": start["specular"].mean()[None],
-        "fresnel": start["fresnel"],
-    }
     labels = np.zeros(len(uv), np.int64)
-    return material_reflectance(surface, labels, 1, start=mean, size=ndf_size)
+    return material_reflectance(surface, labels, 1, size=ndf_size)
 
 
 def _flat_btf(bsdf, uv, w):
