@@ -11,10 +11,14 @@ texels. L is the sum of
 * light l → rest lobe → broad lobe at p_k → v (caustics): photons, the first step of walks from every
   *light's* texels. Where a light's direction is also a view's these are the same walks, used both ways.
 
-Walks go on to the full depth. Nothing is approximated but float32: two independent halves of the points correct
-each other (`surface_gather`), a half gets view rays where the *other* one finds a texel empty, and visibility
-at the vertices of walks is looked up with a traced correction (`surface_cache`). Single values may be negative
-where few points were drawn. Noise is shared: neighbouring views and all lights see the same points and walks.
+Walks go on to the full depth. By construction the expectation is right: two independent halves of the points
+correct each other (`surface_gather`), a half gets view rays where the *other* one finds a texel empty, and
+visibility at the vertices of walks is looked up with a traced correction (`surface_cache`). Against the path
+estimator, 64² texels: tissue in direct light +0.003 % over 20 seeds; to depth 3 +0.05 ± 0.08 % over 10; to depth 8
+−0.12 % over 6, where single images were off by up to 4.2 standard errors, which is not explained. Mean weights of
+the tissue, 1 in theory, are off by up to 0.08 %. Single values may be negative where few points were drawn; a few
+texels, seen by one half only, have a stored variance near 0. Noise is shared: neighbouring views and all lights see
+the same points and walks.
 """
 
 from __future__ import annotations
