@@ -11,6 +11,7 @@ from importlib import import_module
 
 import numpy as np
 
+from btfref.bench.data import MESOSTRUCTURES, material_name, materials
 from btfref.bench.timing import machine
 from btfref.errors import InputError
 
@@ -27,8 +28,6 @@ VARIANTS = {
 
 STORAGES = ("float", "half", "byte")
 CLUSTERS = {"unclustered": None, "clustered": 256}
-
-MESOSTRUCTURES = ("checker", "rings", "tissue")
 
 #: Paths a sample of the BTFs whose errors are measured, and of that whose times are.
 SPP, DRAFT_SPP = 16, 2
@@ -88,12 +87,11 @@ def run(*, quick=False, progress=None, btf=None, only=None):
     n_tables = int(np.prod(timed.texels)) * 3
     errors, ranges = {}, {}
     if quick or btf is not None:
-        name = timed.attributes.get("parent", {}).get("name", "measured")
+        name = material_name(timed)
         errors[name], ranges[name] = judged(timed, variants, kept, report)
     else:
         kept.clear()
-        for name in MESOSTRUCTURES:
-            data = synthesize(name, texels=64, spp=SPP, progress=progress)
+        for name, data in materials(None, MESOSTRUCTURES, texels=64, spp=SPP, progress=progress):
             errors[name], ranges[name] = judged(data, variants, {}, report)
     return {
         "suite": "factors",

@@ -11,9 +11,8 @@ import time
 
 import numpy as np
 
+from btfref.bench.data import MESOSTRUCTURES, materials
 from btfref.bench.timing import machine
-
-MESOSTRUCTURES = ("checker", "rings", "tissue")
 
 TEXELS, SPP = 64, 16
 
@@ -42,16 +41,11 @@ def run(*, quick=False, progress=None, btf=None, only=None):
         ``raw``: seconds.
     """
     from btfref.representations import laplacian
-    from btfref.sampling.synthesis import synthesize
 
     names = only or (MESOSTRUCTURES[:1] if quick else MESOSTRUCTURES)
-    if btf is not None:
-        names = (str(btf.attributes.get("mesostructure", "measured")),)
     summary, raw = {}, {}
-    for name in names:
-        data = btf
-        if data is None:
-            data = synthesize(name, texels=TEXELS, spp=SPP, estimator="surface", progress=progress)
+    settings = {"texels": TEXELS, "spp": SPP, "estimator": "surface"}
+    for name, data in materials(btf, names, progress=progress, **settings):
         channels = _channels(data)
         summary[name], raw[name] = {"table": {}, "bytes": {}}, {}
         for setting, parameters in (("paper", laplacian.PRESETS["paper"]), ("default", {})):

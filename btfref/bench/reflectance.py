@@ -12,15 +12,13 @@ polynomials; peaks and exponents of lobes need the range of a half.
 from __future__ import annotations
 
 import time
-from pathlib import Path
 
+from btfref.bench.data import MESOSTRUCTURES, materials
 from btfref.bench.timing import machine
 from btfref.errors import InputError
 
 #: The paper's columns.
 METHODS = {"LAF": "lafortune", "SLAF": "lafortune_lut", "RFP": "rf_poly", "RFNL": "rf_lobes"}
-
-MESOSTRUCTURES = ("checker", "rings", "tissue")
 
 #: Texels a side and paths a sample: enough for three digits of a mean over texels.
 TEXELS, SPP = 32, 16
@@ -45,17 +43,12 @@ def run(*, quick=False, progress=None, btf=None, only=None):
         ``summary``: by material and column, ``average``, ``minimum``, ``maximum``, ``seconds``, ``not_converged``, and
         ``storage``: bytes of the maps in floats, in halves and in 8 bits, with ε of each; ``raw``: seconds.
     """
-    from btfref.sampling.synthesis import synthesize
-
     columns = {column: key for column, key in METHODS.items() if only is None or column in only}
     if not columns:
         raise InputError("no such column", field="only", got=", ".join(only), expected=", ".join(METHODS))
     names = MESOSTRUCTURES[:1] if quick else MESOSTRUCTURES
-    if btf is not None:
-        names = (material_name(btf),)
     summary, raw = {}, {}
-    for name in names:
-        data = btf if btf is not None else synthesize(name, texels=TEXELS, spp=SPP, progress=progress)
+    for name, data in materials(btf, names, texels=TEXELS, spp=SPP, progress=progress):
         summary[name] = {column: fitted(data, key) for column, key in columns.items()}
         raw[name] = {column: row["seconds"] for column, row in summary[name].items()}
     parameters = {"texels": TEXELS, "spp": SPP} if btf is None else {"shape": list(btf.values.shape)}
@@ -66,15 +59,6 @@ def run(*, quick=False, progress=None, btf=None, only=None):
         "summary": summary,
         "machine": machine(),
     }
-
-
-def material_name(btf):
-    """What a BTF is of: its mesostructure if it was synthesized, else the name of its file."""
-    parent = btf.attributes.get("parent", {})
-    if "mesostructure" in (parent.get("kind"), *btf.attributes):
-        return str(parent.get("name", btf.attributes.get("mesostructure")))
-    path = getattr(btf, "path", None)
-    return Path(path).name.removesuffix(".btf.zarr") if path else "BTF"
 
 
 def fitted(btf, key):

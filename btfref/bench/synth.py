@@ -17,9 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
+from btfref.bench.data import MESOSTRUCTURES
 from btfref.bench.timing import machine
-
-MESOSTRUCTURES = ("checker", "rings", "tissue")
 
 #: Label -> estimator and samples. Errors stand beside the times: equal samples are not equal errors.
 METHODS = {
