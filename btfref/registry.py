@@ -159,7 +159,7 @@ def image_light(key, *, file=None):
     if not row.image_light:
         having = ", ".join(name for name, other in methods().items() if other.image_light)
         raise InputError(
-            "environments need a prefiltered path, which the method lacks",
+            "environments (constant, envmap) need a prefiltered path, which the method lacks",
             file=file,
             field="method",
             got=key,

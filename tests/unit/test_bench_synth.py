@@ -31,7 +31,10 @@ def test_the_table_gives_ratios_to_the_naive_loop():
         "raw": {"checker": {"naive 16": [100.0, 90.0, 110.0], "surface 16": [5.0, 4.0, 5.5]}},
         "errors": {"checker": dict.fromkeys(labels, errors)},
         "peak_bytes": {"checker": dict.fromkeys(labels, 2**30)},
+        "kernel_s": {"checker": {"naive 16": [80.0, 70.0, 90.0]}},
+        "growth": [],
     }
     header, rows = synth.table(result)
     assert [row[header.index("× naive 16")] for row in rows] == ["1.0", "20.0"]
+    assert [row[header.index("× its kernels")] for row in rows] == ["0.8", "16.0"]
     assert rows[1][header.index("MiB")] == "1024"
