@@ -303,11 +303,31 @@ def surface_frame(surface):
     return c * u + s * v, c * v - s * u, normal
 
 
-def fit(btf, *, seed=0, progress=None, **parameters):
-    """Decompose ``btf``: :func:`btfref.decomposition.pipeline.decompose` with its defaults."""
+def fit(
+    btf,
+    *,
+    seed=0,
+    progress=None,
+    depth=0.25,
+    layers=32,
+    pairs=128,
+    window=5,
+    similarity="reciprocity",
+    smoothness=0.01,
+    depth_weight=0.05,
+    materials=None,
+    largest=6,
+    ndf_size=32,
+    iterations=4,
+    storage="half",
+    filter_type="bilinear",
+    intermediates=None,
+):
+    """Decompose ``btf``; parameters are those of :func:`btfref.decomposition.pipeline.decompose`."""
+    settings = {name: value for name, value in locals().items() if name != "btf"}
     from btfref.decomposition.pipeline import decompose
 
-    return decompose(btf, seed=seed, progress=progress, **parameters).representation
+    return decompose(btf, **settings).representation
 
 
 def export_maps(representation, out):
