@@ -24,7 +24,7 @@ class Method:
     title, paper : str
         For people.
     module : str
-        Module with ``Representation`` (the class), ``fit`` and ``PRESETS``.
+        Module with ``Representation`` (the class) and, unless ``fit_module`` has them, ``fit`` and ``PRESETS``.
     plugin : str
         Module with ``Evaluator``, the Dr.Jit port.
     shader : str
@@ -34,6 +34,11 @@ class Method:
     image_light : str
         ``module:class`` of the prefiltered path for environments, as in :mod:`btfref.render.image_light`; "" if the
         method has none.
+    fit_module : str
+        Module with ``fit`` and ``PRESETS``; "" if that is ``module``.
+    editing : str
+        Module with ``export_maps(representation, folder)`` and ``import_maps(folder)``, for a method whose maps are
+        made for editing; "" if they are not.
     """
 
     key: str
@@ -44,6 +49,8 @@ class Method:
     shader: str
     shader_package: str = ""
     image_light: str = ""
+    fit_module: str = ""
+    editing: str = ""
 
     @property
     def representation(self):
@@ -53,15 +60,20 @@ class Method:
     @property
     def fit(self):
         """``fit(btf, *, seed=0, progress=None, **params) -> Representation``."""
-        return import_module(self.module).fit
+        return import_module(self.fit_module or self.module).fit
 
     @property
     def presets(self):
         """Named settings of ``fit``; "paper" has the settings of the method's paper."""
-        return import_module(self.module).PRESETS
+        return import_module(self.fit_module or self.module).PRESETS
+
+    @property
+    def editor(self):
+        """The module that writes maps as pictures for editing and reads them back."""
+        return import_module(self.editing)
 
 
-def _row(key, title, paper, *, ports=None, image_light=None):
+def _row(key, title, paper, *, ports=None, image_light=None, fit=None, editing=None):
     """A row of btfref's own; ``ports`` names the method whose ports evaluate the same maps."""
     return Method(
         key,
@@ -71,6 +83,8 @@ def _row(key, title, paper, *, ports=None, image_light=None):
         plugin=f"mitsuba_plugins.{ports or key}",
         shader=f"representations/{ports or key}.glsl",
         image_light=f"btfref.render.image_light:{image_light}" if image_light else "",
+        fit_module=f"btfref.{fit}" if fit else "",
+        editing=f"btfref.{editing}" if editing else "",
     )
 
 
@@ -105,7 +119,13 @@ _ROWS = (
     ),
     _row("cmf", "Chained matrix factorization, clustered", "Suykens, vom Berge, Lagae, Dutré 2003"),
     _row("hf", "Homomorphic factorization, clustered", "McCool, Ang, Ahmad 2001", ports="cmf"),
-    _row("gbrdf", "g-BRDF: height field with editable microfacet materials", "Menzel, Guthe 2009"),
+    _row(
+        "gbrdf",
+        "g-BRDF: height field with editable microfacet materials",
+        "Menzel, Guthe 2009",
+        fit="decomposition.pipeline",
+        editing="representations.gbrdf_maps",
+    ),
 )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from btfref.representations.gbrdf import ROTATION_FLOOR
+from btfref.numerics.frames import ROTATION_FLOOR
 from mitsuba_plugins.heightfield import HeightField
 from mitsuba_plugins.lookup import wide
 from mitsuba_plugins.parabolic import ParabolicMaps, bilinear_stencil
@@ -77,7 +77,7 @@ class Evaluator:
         ]
 
     def _frame(self, texels, active):
-        """Tangent, bitangent and normal, as `btfref.representations.gbrdf.surface_frame`."""
+        """Tangent, bitangent and normal, as `btfref.numerics.frames.surface_frame`."""
         total = mi.Vector4f(0)
         for texel, weight in texels:
             total = dr.fma(dr.gather(mi.Vector4f, self.surface, texel, active), weight, total)

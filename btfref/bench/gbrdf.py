@@ -53,16 +53,17 @@ def run(*, quick=False, progress=None, btf=None, only=None):
 
 def case(btf, progress=None):
     """Figures of one BTF; see :func:`run`."""
-    from btfref.decomposition.pipeline import decompose
+    from btfref.decomposition import pipeline
     from btfref.registry import method
     from btfref.representations.container import payload_bytes
     from btfref.representations.gbrdf_geometry import from_mesostructure
 
     start = time.perf_counter()
-    made = decompose(btf, progress=progress)
+    stages = {}
+    made = pipeline.fit(btf, progress=progress, intermediates=stages)
     seconds = time.perf_counter() - start
     pairs = len(btf.views) * len(btf.lights) * int(np.prod(btf.texels))
-    others = {"gbrdf": made.representation, "lpca": method("lpca").fit(btf, clusters=16, components=4)}
+    others = {"gbrdf": made, "lpca": method("lpca").fit(btf, clusters=16, components=4)}
     parent = btf.attributes.get("parent", {})
     name, parameters = parent.get("name"), parent.get("parameters", {})
     known = name in ("checker", "rings", "tissue", "flat")
@@ -73,8 +74,8 @@ def case(btf, progress=None):
         "shape": list(btf.values.shape),
         "seconds": seconds,
         "microseconds_per_sample": 1e6 * seconds / pairs,
-        "materials": made.representation.meta["fit"]["materials"],
-        "separation": made.representation.meta["fit"]["separation"],
+        "materials": made.meta["fit"]["materials"],
+        "separation": made.meta["fit"]["separation"],
         "bytes": {
             key: payload_bytes({k: (a.shape, a.dtype.name) for k, a in rep.arrays().items()}, rep.meta)
             for key, rep in others.items()
@@ -82,7 +83,7 @@ def case(btf, progress=None):
         "delta_e00": {key: picture_error(rep, btf) for key, rep in others.items()},
     }
     if known:
-        result["heights"] = height_errors(btf, made, others["oracle"])
+        result["heights"] = height_errors(btf, stages, others["oracle"])
     return result
 
 
@@ -104,18 +105,17 @@ def picture_error(representation, btf):
     return float(np.sqrt((error**2).mean()))
 
 
-def height_errors(btf, made, truth):
+def height_errors(btf, stages, truth):
     """RMS error of heights in tiles and mean angle between normals in degrees, of ours and the paper's baselines."""
     from btfref.decomposition.heights import correlation_heights, helmholtz_stereopsis, similarity
     from btfref.decomposition.pairs import ReciprocalPairs
     from btfref.numerics.heightfield import HeightField
 
-    pairs = ReciprocalPairs(btf, made.representation.meta["parameters"]["pairs"])
-    layers = made.stages["layers"]
+    pairs, layers = ReciprocalPairs(btf), stages["layers"]
     correlation = correlation_heights(similarity(pairs, layers), layers)
     helmholtz, slopes = helmholtz_stereopsis(pairs, layers)
     found = {
-        "ours": (made.stages["fused"], None),
+        "ours": (stages["fused"], None),
         "correlation": (correlation, None),
         "Helmholtz": (helmholtz, slopes),
     }

@@ -12,6 +12,9 @@ from btfref.conventions import LUMINANCE
 #: Directions further from the normal take no part: their images are foreshortened to little more than silhouettes.
 LARGEST_ANGLE = np.radians(62)
 
+#: Pairs of images that take part, unless told otherwise.
+N_PAIRS = 128
+
 #: Share of the mean luminance below which a sample counts as black: its logarithm would be noise.
 BLACK = 0.01
 
@@ -35,7 +38,7 @@ class ReciprocalPairs:
         Luminance in 1/sr that :meth:`logarithms` holds.
     """
 
-    def __init__(self, btf, count, seed=0):
+    def __init__(self, btf, count=N_PAIRS, seed=0):
         self._btf = btf
         views = btf.views.vectors
         near = np.flatnonzero(views[:, 2] >= np.cos(LARGEST_ANGLE))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -10,41 +9,31 @@ import numpy as np
 from btfref.decomposition import heights as height_stage
 from btfref.decomposition.materials import cluster_materials
 from btfref.decomposition.normals import fuse, helmholtz_normals
-from btfref.decomposition.pairs import ReciprocalPairs
+from btfref.decomposition.pairs import N_PAIRS, ReciprocalPairs
 from btfref.decomposition.reflectance import SurfaceSamples, material_reflectance, texel_reflectance
 from btfref.errors import InputError
-from btfref.numerics.heightfield import HeightField
+from btfref.numerics.heightfield import HEIGHT_LIMIT, HeightField
+from btfref.representations.gbrdf_build import from_maps
 from btfref.representations.lookup import positive_integer
 
 #: What heights can be told by.
 SIMILARITIES = ("reciprocity", "correlation")
 
-
-@dataclass(frozen=True)
-class Decomposition:
-    """A g-BRDF and how it came about.
-
-    Attributes
-    ----------
-    representation : btfref.representations.gbrdf.Representation
-    stages : dict of str to ndarray
-        ``similarity`` (layers, rows, columns), ``layers``, ``cut`` and ``fused`` heights in tile units, ``slopes`` of
-        the normals, ``texel_diffuse``, ``texel_specular``, ``texel_fresnel``, ``texel_ndf`` in luminance, ``labels``,
-        ``rotation``, ``separation`` (number of materials, index).
-    """
-
-    representation: object
-    stages: dict = field(repr=False)
+#: "paper": correlation in windows of 5 × 5 and depth weight 0.2 (section 6). The unit of the paper's smoothness, 0.1,
+#: is not given; in ours 0.1 flattens everything, 0.02 is the best for the correlation.
+PRESETS = {
+    "paper": {"similarity": "correlation", "window": 5, "smoothness": 0.02, "depth_weight": 0.2},
+}
 
 
-def decompose(
+def fit(
     btf,
     *,
     seed=0,
     progress=None,
     depth=0.25,
     layers=32,
-    pairs=128,
+    pairs=N_PAIRS,
     window=5,
     similarity="reciprocity",
     smoothness=0.01,
@@ -91,20 +80,22 @@ def decompose(
         Alternations of the materials' least squares.
     storage : {"half", "float"}
     filter_type : {"bilinear", "nearest"}
-    intermediates : path-like, optional
-        An ``.npz`` file for the maps of every stage.
+    intermediates : path-like or dict, optional
+        An ``.npz`` file, or a dictionary, for the maps of every stage: ``similarity`` (layers, rows, columns),
+        ``layers``, ``cut`` and ``fused`` heights in tile units, ``slopes`` of the normals, ``texel_diffuse``,
+        ``texel_specular``, ``texel_fresnel``, ``texel_ndf`` in luminance, ``labels``, ``rotation``, ``separation``
+        (number of materials, index).
 
     Returns
     -------
-    Decomposition
+    btfref.representations.gbrdf.Representation
+        ``meta["fit"]``: ``materials``, ``separation``, ``normals`` (convergence).
 
     Raises
     ------
     InputError
         For parameters out of range, or values that are not finite.
     """
-    from btfref.representations.gbrdf_build import HEIGHT_LIMIT, from_maps
-
     named = {"layers": layers, "pairs": pairs, "window": window, "largest": largest, "iterations": iterations}
     for name, value in named.items():
         positive_integer(name, value)
@@ -192,9 +183,11 @@ def decompose(
     )
     finite = {str(k): v for k, v in separation.items() if np.isfinite(v)}
     representation.meta["fit"] = {"materials": n_materials, "separation": finite, "normals": summary}
-    if intermediates is not None:
+    if isinstance(intermediates, dict):
+        intermediates.update(stages)
+    elif intermediates is not None:
         save_stages(stages, intermediates)
-    return Decomposition(representation, stages)
+    return representation
 
 
 def save_stages(stages, path):

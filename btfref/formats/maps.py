@@ -6,7 +6,6 @@ import os
 import shutil
 import tempfile
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,7 @@ from btfref.sampling.layout import refuse_existing
 def export_maps(path, out):
     """Write every map as one OpenEXR image or, beyond four channels, as one per channel.
 
-    A method whose maps are made for editing has a way of its own: ``export_maps`` in its module.
+    A method whose maps are made for editing has a way of its own: ``export_maps`` in its row's ``editing``.
 
     Parameters
     ----------
@@ -47,9 +46,9 @@ def export_maps(path, out):
     from btfref.representations.container import image_size, load
 
     representation = load(path)
-    module = import_module(method(representation.meta["method"]).module)
-    if hasattr(module, "export_maps"):
-        return module.export_maps(representation, out)
+    row = method(representation.meta["method"])
+    if row.editing:
+        return row.editor.export_maps(representation, out)
     arrays = representation.arrays()
     count = 0
     with new_folder(out) as folder:
@@ -110,7 +109,7 @@ def import_maps(folder):
         key = tomllib.loads(path.read_text(encoding="utf-8")).get("method")
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError("cannot read the scalars", file=path, got=error) from error
-    module = import_module(method(key, file=path).module)
-    if not hasattr(module, "import_maps"):
+    row = method(key, file=path)
+    if not row.editing:
         raise InputError("the method does not take its maps back", file=path, field="method", got=key)
-    return module.import_maps(folder)
+    return row.editor.import_maps(folder)

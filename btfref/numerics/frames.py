@@ -1,8 +1,12 @@
-"""Tangent frames, identical to Mitsuba's shading frame (``SurfaceInteraction.initialize_sh_frame``)."""
+"""Tangent frames: Mitsuba's shading frame (``SurfaceInteraction.initialize_sh_frame``), and that of a height field."""
 
 from __future__ import annotations
 
 import numpy as np
+
+#: Length of interpolated cosine and sine below which tangents of all directions meet: there is no turn to speak of, and
+#: float32 would make one up (its rounding of 6e-8 turns a tangent by 6e-6 at this length).
+ROTATION_FLOOR = 0.01
 
 
 def shading_frame(normal, dp_du):
@@ -46,3 +50,31 @@ def nearest_rotation(linear):
     cosine, sine = a + d, c - b
     length = float(np.hypot(cosine, sine))
     return (cosine / length, sine / length) if length > 0 else (1.0, 0.0)
+
+
+def surface_frame(surface):
+    """Tangent frame of slopes and of a rotation.
+
+    Parameters
+    ----------
+    surface : ndarray, shape (N, 4)
+        Slopes along u and v, cosine and sine of the rotation (of any length; below :data:`ROTATION_FLOOR` they count as
+        no rotation).
+
+    Returns
+    -------
+    tangent, bitangent, normal : ndarray, shape (N, 3)
+        Orthonormal. Without rotation the tangent is x, projected to the tangent plane.
+    """
+    sx, sy, cosine, sine = np.asarray(surface, float).T
+    one = np.ones_like(sx)
+    normal = np.stack([-sx, -sy, one], -1) / np.sqrt(1 + sx * sx + sy * sy)[:, None]
+    # (1 − n_x², −n_x n_y, −n_x n_z) up to its length, with the cancellation taken out.
+    u = np.stack([1 + sy * sy, -sx * sy, sx], -1)
+    u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    v = np.cross(normal, u)
+    length = np.hypot(cosine, sine)
+    there = length > ROTATION_FLOOR
+    c = np.where(there, cosine / np.where(there, length, 1), 1)[:, None]
+    s = np.where(there, sine / np.where(there, length, 1), 0)[:, None]
+    return c * u + s * v, c * v - s * u, normal

@@ -19,6 +19,9 @@ import numpy as np
 #: held at this limit, which is part of the definition. 4 tiles through a field 0.15 deep are 88° from the normal.
 MAXIMUM_TRAVEL = 4.0
 
+#: Tiles that a height may be away from the plane z = 0, as for mesostructures.
+HEIGHT_LIMIT = 4.0
+
 #: Shadow rays start this share of the height's range above the surface: rounding must not shadow a point by itself.
 LIFT = 1e-5
 

@@ -17,24 +17,15 @@ from functools import cached_property
 import numpy as np
 
 from btfref import conventions
+from btfref.numerics.frames import surface_frame
 from btfref.numerics.heightfield import LIFT, HeightField
 from btfref.numerics.microfacets import geometry_factor, schlick, specular_albedo_bound
 from btfref.numerics.parabolic import bilinear_stencil
 from btfref.representations.guide import group_means, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points
 
-#: "paper": correlation in windows of 5 × 5 and depth weight 0.2 (section 6). The unit of the paper's smoothness, 0.1,
-#: is not given; in ours 0.1 flattens everything, 0.02 is the best for the correlation.
-PRESETS = {
-    "paper": {"similarity": "correlation", "window": 5, "smoothness": 0.02, "depth_weight": 0.2},
-}
-
 #: Tiles by which a port's hit may differ from the definition's: float32 positions at the far end of the longest ray.
 HIT_TOLERANCE = 2e-6
-
-#: Length of interpolated cosine and sine below which tangents of all directions meet: there is no turn to speak of, and
-#: float32 would make one up (its rounding of 6e-8 turns a tangent by 6e-6 at this length).
-ROTATION_FLOOR = 0.01
 
 #: Directions in which a hit is moved to find its neighbourhood.
 _MOVES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
@@ -273,72 +264,3 @@ def texel_weights(hit, shape, filter_type):
         return (row * columns + column)[:, None], np.ones((len(a), 1))
     index = np.stack([r0 * columns + c0, r0 * columns + c1, r1 * columns + c0, r1 * columns + c1], -1)
     return index, np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], -1)
-
-
-def surface_frame(surface):
-    """Tangent frame of slopes and of a rotation.
-
-    Parameters
-    ----------
-    surface : ndarray, shape (N, 4)
-        Slopes along u and v, cosine and sine of the rotation (of any length; below :data:`ROTATION_FLOOR` they count as
-        no rotation).
-
-    Returns
-    -------
-    tangent, bitangent, normal : ndarray, shape (N, 3)
-        Orthonormal. Without rotation the tangent is x, projected to the tangent plane.
-    """
-    sx, sy, cosine, sine = np.asarray(surface, float).T
-    one = np.ones_like(sx)
-    normal = np.stack([-sx, -sy, one], -1) / np.sqrt(1 + sx * sx + sy * sy)[:, None]
-    # (1 − n_x², −n_x n_y, −n_x n_z) up to its length, with the cancellation taken out.
-    u = np.stack([1 + sy * sy, -sx * sy, sx], -1)
-    u /= np.linalg.norm(u, axis=-1, keepdims=True)
-    v = np.cross(normal, u)
-    length = np.hypot(cosine, sine)
-    there = length > ROTATION_FLOOR
-    c = np.where(there, cosine / np.where(there, length, 1), 1)[:, None]
-    s = np.where(there, sine / np.where(there, length, 1), 0)[:, None]
-    return c * u + s * v, c * v - s * u, normal
-
-
-def fit(
-    btf,
-    *,
-    seed=0,
-    progress=None,
-    depth=0.25,
-    layers=32,
-    pairs=128,
-    window=5,
-    similarity="reciprocity",
-    smoothness=0.01,
-    depth_weight=0.05,
-    materials=None,
-    largest=6,
-    ndf_size=32,
-    iterations=4,
-    storage="half",
-    filter_type="bilinear",
-    intermediates=None,
-):
-    """Decompose ``btf``; parameters are those of :func:`btfref.decomposition.pipeline.decompose`."""
-    settings = {name: value for name, value in locals().items() if name != "btf"}
-    from btfref.decomposition.pipeline import decompose
-
-    return decompose(btf, **settings).representation
-
-
-def export_maps(representation, out):
-    """Write the maps as pictures: :func:`btfref.representations.gbrdf_maps.export_maps`."""
-    from btfref.representations import gbrdf_maps
-
-    return gbrdf_maps.export_maps(representation, out)
-
-
-def import_maps(folder):
-    """Read them back: :func:`btfref.representations.gbrdf_maps.import_maps`."""
-    from btfref.representations import gbrdf_maps
-
-    return gbrdf_maps.import_maps(folder)

@@ -7,12 +7,10 @@ import numpy as np
 from btfref.conventions import FILTER_TYPES
 from btfref.errors import InputError
 from btfref.numerics.directions import directions
+from btfref.numerics.heightfield import HEIGHT_LIMIT
 from btfref.numerics.microfacets import isotropic_ndf
 from btfref.representations.gbrdf import Representation, field_constants
 from btfref.representations.lookup import direction_arrays, meta_for, stored
-
-#: Tiles that a height may be away from the plane z = 0, as for mesostructures.
-HEIGHT_LIMIT = 4.0
 
 #: Turns are stored in steps of 1/1530: the fully saturated hues of an 8-bit picture, so that pictures lose nothing.
 HUE_STEPS = 6 * 255

@@ -290,13 +290,3 @@ def test_photograph(rng, tmp_path):
 def test_bad_maps_name_the_field(rng, changes, field):
     with pytest.raises(InputError, match=field):
         edited(rng, **changes)
-
-
-def test_the_fit_takes_what_the_decomposition_takes():
-    """The command line reads the fit's signature: names and defaults are the decomposition's."""
-    import inspect
-
-    from btfref.decomposition.pipeline import decompose
-    from btfref.representations.gbrdf import fit
-
-    assert inspect.signature(fit) == inspect.signature(decompose)
