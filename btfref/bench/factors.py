@@ -172,8 +172,8 @@ def table_errors(fitted, btf):
         each, under one exposure.
     """
     from btfref.compare.colour import delta_e00, fit_display
+    from btfref.numerics.factoring import map_operators
     from btfref.representations.factored import texel_parts
-    from btfref.representations.factored_fit import map_operators
 
     operators = map_operators(
         btf.views.vectors, btf.lights.vectors, fitted.maps["factor_p"].shape[1], "factor_d" in fitted.maps

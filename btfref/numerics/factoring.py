@@ -11,6 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from btfref.numerics.halfway import half_difference
+from btfref.numerics.parabolic import bilinear_stencil
+
 #: Below this, a quotient's denominator counts as this: tables are scaled to a mean of 1, so nothing of use is so small,
 #: and squares of it are still normal floats.
 TINY = np.float32(1e-18)
@@ -191,3 +194,25 @@ def refine(data, factors, operators, sweeps, weight=1):
                 values = operators.read(other, factors[other])
                 update(name, a * values, b * values)
     return factors
+
+
+def map_operators(views, lights, n, with_difference):
+    """How n × n parabolic maps are read at all pairs of directions.
+
+    Parameters
+    ----------
+    views, lights : ndarray, shape (…, 3)
+    n : int
+    with_difference : bool
+
+    Returns
+    -------
+    FactorOperators
+    """
+    h, d = half_difference(lights[None], views[:, None])
+    directions = {"p": lights, "q": h.reshape(-1, 3), "r": views, "d": d.reshape(-1, 3)}
+    if not with_difference:
+        del directions["d"]
+    return FactorOperators(
+        **{name: sparse_operator(*bilinear_stencil(w, n), n * n) for name, w in directions.items()}
+    )

@@ -16,6 +16,7 @@ from btfref.numerics.directions import DirectionSet, ring_directions
 from btfref.numerics.factoring import (
     TINY,
     FactorOperators,
+    map_operators,
     rank_terms,
     refine,
     sample_weights,
@@ -29,7 +30,6 @@ from btfref.representations.factored_fit import (
     checked_map_size,
     checked_ranges,
     factorized,
-    map_operators,
 )
 from btfref.representations.factored_storage import Storing, fitted
 from btfref.representations.lookup import positive_integer

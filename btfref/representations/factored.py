@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from btfref import conventions
+from btfref.numerics.factoring import map_operators
 from btfref.numerics.halfway import half_difference
 from btfref.numerics.parabolic import bilinear_stencil
 from btfref.representations.guide import N_GROUPS, feature_views, group_means, texel_groups
@@ -123,8 +124,6 @@ class Representation(StoredMaps):
 
     def sampling_tables(self):
         """Groups of texels alike, and the means of some of their members."""
-        from btfref.representations.factored_fit import map_operators
-
         n_texels = int(np.prod(self.meta["texels"]))
         views = self.maps["view_directions"].astype(float)
         lights = self.maps["light_directions"].astype(float)

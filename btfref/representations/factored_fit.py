@@ -7,9 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics.factoring import FactorOperators, sparse_operator
-from btfref.numerics.halfway import half_difference
-from btfref.numerics.parabolic import bilinear_stencil
 from btfref.representations.factored import texel_parts
 from btfref.representations.lookup import positive_integer
 
@@ -137,25 +134,3 @@ def unit_tables(btf, texels):
     tables = np.maximum(tables, 0)
     mean = tables.mean((0, 1))
     return tables / np.where(mean > 0, mean, 1), mean
-
-
-def map_operators(views, lights, n, with_difference):
-    """How n × n parabolic maps are read at all pairs of directions.
-
-    Parameters
-    ----------
-    views, lights : ndarray, shape (…, 3)
-    n : int
-    with_difference : bool
-
-    Returns
-    -------
-    FactorOperators
-    """
-    h, d = half_difference(lights[None], views[:, None])
-    directions = {"p": lights, "q": h.reshape(-1, 3), "r": views, "d": d.reshape(-1, 3)}
-    if not with_difference:
-        del directions["d"]
-    return FactorOperators(
-        **{name: sparse_operator(*bilinear_stencil(w, n), n * n) for name, w in directions.items()}
-    )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics.factoring import TINY, sample_weights
+from btfref.numerics.factoring import TINY, map_operators, sample_weights
 from btfref.numerics.lowrank import range_basis
 from btfref.representations.factored import (
     FACTORS,
@@ -17,7 +17,7 @@ from btfref.representations.factored import (
     index_slots,
     texel_parts,
 )
-from btfref.representations.factored_fit import Steps, map_operators, unit_tables
+from btfref.representations.factored_fit import Steps, unit_tables
 from btfref.representations.lookup import base_meta, direction_arrays, stored
 
 #: Storage of the maps: floats, halves, or 8-bit codes of [0, 1].

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from btfref.numerics.factoring import map_operators
 from btfref.numerics.parabolic import texel_centres
 from btfref.representations.factored import Representation
 from btfref.representations.factored_fit import (
@@ -18,7 +19,6 @@ from btfref.representations.factored_fit import (
     checked_map_size,
     checked_ranges,
     factorized,
-    map_operators,
     unit_tables,
 )
 from btfref.representations.factored_storage import Storing, fitted

@@ -10,6 +10,7 @@ from btfref.numerics.phong import fit_phong, phong
 from btfref.numerics.pyramid import expand_image, gaussian_pyramid, level_shapes
 from btfref.numerics.ycbcr import CHANNELS, FROM_RGB, RGB_METRIC, RGB_WEIGHT
 from btfref.representations.analytic import edge_constants
+from btfref.representations.laplacian_levels import Representation
 from btfref.representations.lookup import base_meta, direction_arrays, stored
 
 #: Numbers of components of Y, Cb and Cr at each level (section 3.3 of the paper).
@@ -82,8 +83,6 @@ def fit(
     InputError
         For parameters out of range, or a target that no allowed number of components reaches.
     """
-    from btfref.representations.laplacian import Representation
-
     for name, value in (("mean", mean), ("prediction", prediction), ("directions", directions)):
         if value not in _CHOICES[name]:
             raise InputError(

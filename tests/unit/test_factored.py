@@ -212,7 +212,7 @@ def test_hf_bounds_what_no_sample_reaches():
     """Elsewhere the maps are the same; beyond the samples the smoothing extrapolates to more."""
     btf = oracle_btf((5, 4))
     free, bounded = (hf.factorize(btf, smoothness=0.3, bounded=b).maps["q"][:, 0] for b in (False, True))
-    operators = factored_fit.map_operators(btf.views.vectors, btf.lights.vectors, 32, False)
+    operators = factoring.map_operators(btf.views.vectors, btf.lights.vectors, 32, False)
     reached = (operators.q.max(0).toarray().ravel() > hf.REACHED).reshape(32, 32)
     np.testing.assert_array_equal(free[:, reached], bounded[:, reached])
     assert (bounded.max((1, 2)) == free[:, reached].max(1)).all()

@@ -1,6 +1,6 @@
-"""The four edits of the g-BRDF paper (section 6, Table 2), each on its maps and each rendered: docs/gbrdf-edits.png.
+"""The four edits of the g-BRDF paper (section 6, Table 2), each on its maps and each rendered: ``gbrdf-edits.png``.
 
-Run in a checkout: ``python docs/gbrdf_edits.py FOLDER``. The maps before and after every edit stay in FOLDER.
+Run in a checkout: ``python btfref/docs/gbrdf_edits.py FOLDER``. The maps before and after every edit stay in FOLDER.
 """
 
 import sys

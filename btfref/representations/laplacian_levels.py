@@ -1,0 +1,178 @@
+"""The maps of a Laplacian pyramid and their definition; see :mod:`btfref.representations.laplacian`."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from btfref.conventions import texel_stencil
+from btfref.numerics import interpolation
+from btfref.numerics.phong import phong
+from btfref.numerics.pyramid import clamped_lod, expand_image, level_weights
+from btfref.numerics.ycbcr import TO_RGB
+from btfref.representations.analytic import held
+from btfref.representations.guide import N_GROUPS, feature_views, group_means, texel_groups
+from btfref.representations.lookup import StoredMaps, evaluate_points, packed_arrays
+
+
+class Representation(StoredMaps):
+    """Maps of a Laplacian pyramid.
+
+    ``basis_K`` [view, light, component] and ``weights_K`` [row, column, component] of each level K, components of Y
+    before those of Cb and Cr; ``mean`` [view, light, 3] or ``phong`` [1, 6] = (k_a, k_d, k_s, α, Cb, Cr); the
+    direction tables. ``meta["levels"]`` lists rows, columns and numbers of components of each level.
+    """
+
+    @property
+    def max_lod(self):
+        """λ of the coarsest level."""
+        return len(self.meta["levels"]) - 1.0
+
+    def evaluate(self, uv, w_light, w_view, *, lod=0.0):
+        """See :meth:`btfref.representations.protocol.Representation.evaluate`.
+
+        ``lod`` has the shape of one value a lookup or broadcasts to it; it is clamped to [0, λ_max]. Between whole
+        numbers the levels' images are blended, so that the value is continuous in λ. May be slightly negative where
+        the truncated expansion undershoots.
+        """
+        views, lights = (interpolation.from_arrays(self.maps, kind) for kind in ("view", "light"))
+        nearest = self.meta["constants"]["nearest_directions"]
+        levels = self.meta["levels"]
+
+        def lookup(uv, w_light, w_view, lod):
+            view, light = views.stencil(w_view), lights.stencil(w_light, hold=False)
+            if nearest:
+                view, light = (_heaviest(*stencil) for stencil in (view, light))
+            pairs = view[0][:, :, None], light[0][:, None, :]
+            pair_weight = view[1][:, :, None] * light[1][:, None, :]
+            total = self._mean(w_light, w_view, pairs, pair_weight)
+            lod = clamped_lod(lod, len(levels))
+            for k, share in enumerate(level_weights(lod, len(levels))):
+                used = np.flatnonzero(lod < k + 1)
+                if f"basis_{k}" not in self.maps or not len(used):
+                    continue
+                total[used] += share[used, None] * self._level(
+                    k, uv[used], [p[used] for p in pairs], pair_weight[used]
+                )
+            return total @ TO_RGB.T
+
+        return evaluate_points(lookup, uv, w_light, w_view, lod)
+
+    def _mean(self, w_light, w_view, pairs, pair_weight):
+        """μ' in Y, Cb, Cr, shape (N, 3)."""
+        if "mean" in self.maps:
+            return np.einsum("nvl,nvlc->nc", pair_weight, self.maps["mean"][pairs].astype(float))
+        parameters, constants = self.maps["phong"][0].astype(float), self.meta["constants"]
+        light, fade = held(w_light, constants["light_edge"])
+        view, _ = held(w_view, constants["view_edge"])
+        result = np.broadcast_to(parameters[[0, 4, 5]], (len(w_light), 3)).copy()
+        result[:, 0] = phong(parameters[:4], light, view)
+        return fade[:, None] * result
+
+    def _level(self, k, uv, pairs, pair_weight):
+        """D_kᵀ E_k in Y, Cb, Cr, shape (N, 3)."""
+        level = self.meta["levels"][k]
+        shape = level["rows"], level["columns"]
+        texel, texel_weight = texel_stencil(uv, shape, self.meta["filter_type"])
+        weights = self.maps[f"weights_{k}"].astype(float)
+        weights = weights.reshape(-1, weights.shape[-1])
+        coefficient = np.einsum("nt,ntk->nk", texel_weight, weights[texel])
+        table = self.maps[f"basis_{k}"][tuple(pairs)].astype(float)
+        product = coefficient * np.einsum("nvl,nvlk->nk", pair_weight, table)
+        ends = np.cumsum([0, *level["components"]])
+        return np.stack([product[:, a:b].sum(1) for a, b in pairwise(ends)], -1)
+
+    def tables(self, channel):
+        """What the stored maps say of one of Y, Cb and Cr at the finest texel centres and the measured pairs.
+
+        Parameters
+        ----------
+        channel : {0, 1, 2}
+
+        Returns
+        -------
+        ndarray of float32, shape (texels, n_views · n_lights)
+        """
+        shape = tuple(self.meta["texels"])
+        average = self._luminance_mean() if channel == 0 else self._colour_mean(channel)
+        total = np.tile(average.reshape(1, -1), (shape[0] * shape[1], 1))
+        for k, level in enumerate(self.meta["levels"]):
+            start, end = np.cumsum([0, *level["components"]])[channel : channel + 2]
+            if end > start:
+                weights = self.maps[f"weights_{k}"][..., start:end].astype(np.float32)
+                weights = expand_image(weights, shape, self.meta["filter_type"]).reshape(len(total), -1)
+                basis = self.maps[f"basis_{k}"][..., start:end].astype(np.float32)
+                total += weights @ basis.reshape(-1, end - start).T
+        return total
+
+    def port_arrays(self):
+        """Two tables of entries of one length, so that ports can loop over levels.
+
+        ``basis`` [level, view, light, component] and ``weights`` [texels of all levels, component], of the levels that
+        have components; each channel padded with zeros to its largest number of components.
+        """
+        constants = self.meta["constants"]
+        most = [constants[f"n_{name}"] for name in ("y", "cb", "cr")]
+        first = np.cumsum([0, *most])
+        n_views, n_lights = (len(self.maps[f"{kind}_directions"]) for kind in ("view", "light"))
+        kind = next((a.dtype for name, a in self.maps.items() if name.startswith("basis_")), np.float32)
+        levels = self.meta["levels"][: constants["n_levels"]]
+        basis = np.zeros((len(levels), n_views, n_lights, first[-1]), kind)
+        weights = []
+        for k, level in enumerate(levels):
+            ends = np.cumsum([0, *level["components"]])
+            weights.append(np.zeros((level["rows"] * level["columns"], first[-1]), kind))
+            for start, a, b in zip(first, ends, ends[1:], strict=False):
+                if b > a:
+                    basis[k, ..., start : start + b - a] = self.maps[f"basis_{k}"][..., a:b]
+                    own = self.maps[f"weights_{k}"][..., a:b]
+                    weights[k][:, start : start + b - a] = own.reshape(-1, b - a)
+        others = {name: a for name, a in self.maps.items() if not name.startswith(("basis_", "weights_"))}
+        return packed_arrays({**others, "basis": basis, "weights": np.concatenate(weights)})
+
+    @property
+    def sampling_levels(self):
+        """Number of levels that :meth:`sampling_tables` has guides for."""
+        return len(self.meta["levels"])
+
+    def sampling_tables(self, level=0):
+        """Groups of texels of a level alike, and their means; half as many groups a level."""
+        own = self.meta["levels"][level]
+        shape = own["rows"], own["columns"]
+        n_views = len(self.maps["view_directions"])
+        coefficient = [np.ones((shape[0] * shape[1], 1), np.float32)]
+        tables = [self._luminance_mean()[None]]
+        for k in range(level, len(self.meta["levels"])):
+            n = self.meta["levels"][k]["components"][0]
+            if not n:
+                continue
+            weights = self.maps[f"weights_{k}"][..., :n].astype(np.float32)
+            weights = expand_image(weights, shape, self.meta["filter_type"])
+            coefficient.append(weights.reshape(-1, n))
+            tables.append(np.moveaxis(self.maps[f"basis_{k}"][..., :n], -1, 0).astype(np.float32))
+        coefficient, table = np.concatenate(coefficient, 1), np.concatenate(tables)
+        some = table[:, feature_views(n_views)].reshape(len(table), -1)
+        labels = texel_groups(coefficient @ some, max(1, N_GROUPS >> level))
+        return labels.reshape(shape), np.tensordot(group_means(labels, coefficient), table, 1)
+
+    def _luminance_mean(self):
+        """μ' of Y at the measured pairs, shape (n_views, n_lights)."""
+        if "mean" in self.maps:
+            return self.maps["mean"][..., 0].astype(np.float32)
+        views, lights = (self.maps[f"{kind}_directions"].astype(float) for kind in ("view", "light"))
+        w_view, w_light = np.broadcast_arrays(views[:, None], lights[None])
+        return phong(self.maps["phong"][0, :4], w_light, w_view).astype(np.float32)
+
+    def _colour_mean(self, channel):
+        """μ' of Cb (1) or Cr (2) at the measured pairs."""
+        if "mean" in self.maps:
+            return self.maps["mean"][..., channel].astype(np.float32)
+        shape = [len(self.maps[f"{kind}_directions"]) for kind in ("view", "light")]
+        return np.full(shape, self.maps["phong"][0, 3 + channel], np.float32)
+
+
+def _heaviest(index, weight):
+    """The sample with the largest weight, with the weight of all."""
+    best = np.argmax(weight, 1)[:, None]
+    return np.take_along_axis(index, best, 1), weight.sum(1, keepdims=True)
