@@ -1,8 +1,10 @@
 """Render a Mitsuba scene with OpenGL: the real-time image.
 
-Meshes with BTF materials, a perspective camera, directional and point lights, and an envmap or constant emitter for
-methods with a prefiltered path. No cast shadows: compare with `btfref render --noise-free N --no-shadows`. The image is
-the mean of a regular sub-pixel grid (--grid).
+Meshes with BTF materials, a perspective camera, directional and point lights, and an envmap or constant emitter. No
+cast shadows: compare with `btfref render --no-shadows`. The image is the mean of a regular sub-pixel grid (--grid).
+
+--environment says how an envmap lights: "prefiltered" maps, for the methods that have them, "lights", directional
+lights that stand for it, for any method, or "auto", the first of these that there is.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from btfref.commands._shared import (
     size,
     write_images,
 )
+from btfref.render.paths import PATHS
 from btfref.scenes import scene_file
 
 
@@ -36,6 +39,15 @@ def add_arguments(parser):
         default="all",
         help="measured views to keep in memory: all, or those that the camera can see",
     )
+    parser.add_argument(
+        "--environment", choices=PATHS, default="auto", help="how an envmap lights (default auto)"
+    )
+    parser.add_argument(
+        "--lights",
+        type=count(1),
+        metavar="N",
+        help="that stand for it (default: for an estimated error of 1 %%)",
+    )
     parser.add_argument("--png", action="store_true", help="also write X.png, for eyes")
     parser.add_argument("--json", action="store_true", help="print frame time and OpenGL renderer as JSON")
 
@@ -47,10 +59,22 @@ def run(args):
 
     from btfref.render.realtime import realtime
 
-    result = realtime(scene, parameters=parameters, grid=args.grid, size=args.size, views=args.views)
+    result = realtime(
+        scene,
+        parameters=parameters,
+        grid=args.grid,
+        size=args.size,
+        views=args.views,
+        environment=args.environment,
+        lights=args.lights,
+    )
     write_images(result.image, out, png=args.png)
     if args.json:
         emit_json(result.meta)
     else:
-        emit(f"{out}: {result.meta['frame_ms']:.3g} ms a frame on {result.meta['gl_renderer']}")
+        meta = result.meta
+        emit(f"{out}: {meta['frame_ms']:.3g} ms a frame on {meta['gl_renderer']}")
+        if "environment_lights" in meta:
+            error = f"estimated error {100 * meta['estimated_error']:.2g} %"
+            emit(f"environment: {meta['environment_lights']} lights, {error}")
     return 0

@@ -2,7 +2,8 @@
 
 A shader is put together from small files. ``#include "lib/table.glsl"`` is replaced by the text of that file,
 once: later includes of the same file are empty. Names are looked up in the given directories, then in the
-library (``shaders/``). The name ``representation`` stands for the file of the representation that is shown.
+library (``shaders/``). The name ``representation`` stands for the file of the representation that is shown,
+``environment`` for that of the way in which an environment lights it.
 Anything else that looks like an include, an unknown name, a cycle, or an include inside a conditional (which
 would hide the file from later includes) is an error, never a silent omission.
 """
@@ -18,6 +19,9 @@ from btfref.platform import shader_directory
 
 #: The placeholder name in hosts for the representation's own file.
 REPRESENTATION = "representation"
+
+#: The placeholder for the way that an environment lights it; empty where none does.
+ENVIRONMENT = "environment"
 
 #: Version line and precision statements of the two dialects: desktop OpenGL 3.3 and OpenGL ES 3.0 (WebGL 2).
 #: ES has no default precision for these types in fragment shaders, and lowp for samplers.
@@ -61,7 +65,7 @@ class ShaderSource(str):
         return _LOCATION.sub(name, log)
 
 
-def compose(name, defines=None, *, representation=None, directories=(), target="330 core"):
+def compose(name, defines=None, *, representation=None, environment=None, directories=(), target="330 core"):
     """Put a shader together.
 
     Parameters
@@ -72,6 +76,8 @@ def compose(name, defines=None, *, representation=None, directories=(), target="
         Constants; see :func:`define_block`.
     representation : str or path-like, optional
         The file for ``#include "representation"``: a name in the directories or the library, or a path.
+    environment : str or path-like, optional
+        The file for ``#include "environment"``; without it that include is empty.
     directories : sequence of path-like
         Searched before the library; for shaders of third-party methods.
     target : {"330 core", "300 es"}
@@ -99,6 +105,10 @@ def compose(name, defines=None, *, representation=None, directories=(), target="
                     "no representation was given for this include", file=asked_by, field=included
                 )
             wanted = str(representation)
+        if included == ENVIRONMENT:
+            if environment is None:
+                return []
+            wanted = str(environment)
         path = _find(wanted, search, asked_by)
         if path in stack:
             chain = " → ".join([*(p.name for p in stack), path.name])

@@ -116,6 +116,8 @@ class ShaderRepresentation:
         Where to look for it before the library.
     texels : (int, int)
         Rows and columns of the finest level.
+    environment : str or None
+        File with ``btf_environment``.
     """
 
     textures: dict
@@ -123,31 +125,30 @@ class ShaderRepresentation:
     shader: str
     directories: list
     texels: tuple = (1, 1)
+    environment: str | None = None
 
     @classmethod
-    def upload(cls, ctx, rep, *, filter_type=None, environment=None):
-        """Put ``rep`` on the GPU; ``filter_type`` overrides the file's texel filter.
+    def upload(cls, ctx, rep, *, filter_type=None, light=None):
+        """Put ``rep`` on the GPU.
 
-        With an environment, what its method's prefiltered path needs comes along, and the shader is the one with
-        ``btf_environment``.
+        Parameters
+        ----------
+        ctx : moderngl.Context
+        rep : Representation
+        filter_type : {"nearest", "bilinear"}, optional
+            Overrides the file's texel filter.
+        light : btfref.render.lighting.Prepared, optional
+            How an environment lights it: its tables come along.
         """
         defines = shader_defines(rep, filter_type=filter_type)
         shader, directories = shader_file(rep)
         arrays = rep.port_arrays()
-        if environment is not None:
-            from btfref.registry import image_light
-
-            light = image_light(rep.meta["method"])
-            tables = light.tables(rep, environment)
-            defines |= {
-                f"{name}_DIM{axis}".upper(): n
-                for name, table in tables.items()
-                for axis, n in enumerate(table.shape)
-            }
-            arrays = {**arrays, **packed_arrays(tables)}
-            shader, defines["HAS_ENVIRONMENT"] = light.SHADER, True
+        if light is not None:
+            defines |= light_defines(light.tables)
+            arrays = {**arrays, **packed_arrays(light.tables)}
         textures = {name: upload(ctx, array, name) for name, array in arrays.items()}
-        return cls(textures, defines, shader, directories, tuple(rep.meta.get("texels", (1, 1))))
+        texels = tuple(rep.meta.get("texels", (1, 1)))
+        return cls(textures, defines, shader, directories, texels, light and light.shader)
 
     def program(self, ctx, vertex, fragment=None, *, varyings=(), defines=None):
         """Compile hosts with this representation; see :func:`compile_program`."""
@@ -158,6 +159,7 @@ class ShaderRepresentation:
             varyings=varyings,
             defines={**self.defines, **(defines or {})},
             representation=self.shader,
+            environment=self.environment,
             directories=self.directories,
         )
 
@@ -171,6 +173,14 @@ def shader_defines(rep, *, filter_type=None):
     """Constants of a representation's shader, the texel filter included; for the composer."""
     filter_type = filter_type or rep.meta["filter_type"]
     return {**composer.representation_defines(rep), "FILTER_BILINEAR": filter_type == "bilinear"}
+
+
+def light_defines(tables):
+    """Constants of the shader that reads the tables of a way to light: their shapes before padding."""
+    shapes = {
+        f"{name}_DIM{axis}".upper(): n for name, table in tables.items() for axis, n in enumerate(table.shape)
+    }
+    return {**shapes, "HAS_ENVIRONMENT": True}
 
 
 def shader_file(rep):

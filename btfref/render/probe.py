@@ -37,14 +37,14 @@ def probe(rep, uv, w_light, w_view, lod=0.0, *, filter_type=None):
     return _transformed(tables, "hosts/probe.vert", names, points)
 
 
-def probe_environment(rep, environment, uv, w_view, to_world, *, filter_type=None):
+def probe_environment(rep, light, uv, w_view, to_world, *, filter_type=None):
     """Radiance of ``rep`` under an environment, computed by its shader.
 
     Parameters
     ----------
     rep : Representation
-        Of a method with a prefiltered path.
-    environment : btfref.render.environment.Environment
+    light : btfref.render.lighting.Prepared
+        How the environment lights it.
     uv : array_like, shape (N, 2)
     w_view : array_like, shape (N, 3)
         Local frame.
@@ -60,15 +60,11 @@ def probe_environment(rep, environment, uv, w_view, to_world, *, filter_type=Non
     ------
     MissingDependencyError
         Without an OpenGL driver.
-    InputError
-        For a method without a prefiltered path.
     """
     axes = np.swapaxes(np.asarray(to_world, np.float32), 1, 2).reshape(-1, 9)
     points = np.concatenate([np.asarray(uv, np.float32), np.asarray(w_view, np.float32), axes], 1)
     names = {"uv": 2, "w_view": 3, "axis_x": 3, "axis_y": 3, "axis_z": 3}
-    tables = gl.ShaderRepresentation.upload(
-        gl.context(), rep, filter_type=filter_type, environment=environment
-    )
+    tables = gl.ShaderRepresentation.upload(gl.context(), rep, filter_type=filter_type, light=light)
     return _transformed(tables, "hosts/probe_environment.vert", names, points)
 
 

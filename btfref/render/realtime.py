@@ -1,9 +1,9 @@
 """The real-time renderer: the same scene through GLSL, without a window.
 
-Direct light of directional and point lights without cast shadows, and light from an environment where the method has
-a prefiltered path (:mod:`btfref.render.image_light`); the environment itself is not drawn. The sub-pixel grid is the
-one of the noise-free reference (:mod:`btfref.render.reference`): n × n regular samples a pixel, box filter. Each sample
-is one frame with a shifted projection; frames are added in float64.
+Direct light of directional and point lights and of an environment (:mod:`btfref.render.lighting`), without cast
+shadows; the environment itself is not drawn. The sub-pixel grid is the one of the noise-free reference
+(:mod:`btfref.render.reference`): n × n regular samples a pixel, box filter. Each sample is one frame with a shifted
+projection; frames are added in float64.
 """
 
 from __future__ import annotations
@@ -15,14 +15,24 @@ import numpy as np
 from btfref import representations
 from btfref.demand import scene_views
 from btfref.errors import BtfrefError, InputError
-from btfref.registry import image_light
 from btfref.render import gl
+from btfref.render.lighting import Lighting
 from btfref.render.result import RenderResult
 from btfref.render.scene import SceneDescription, read_scene
 from btfref.render.shapes import neighbours
 
 
-def realtime(scene, *, parameters=None, grid=4, size=None, views="all", count_fetches=False):
+def realtime(
+    scene,
+    *,
+    parameters=None,
+    grid=4,
+    size=None,
+    views="all",
+    environment="auto",
+    lights=None,
+    count_fetches=False,
+):
     """Render a scene with OpenGL.
 
     Parameters
@@ -37,6 +47,10 @@ def realtime(scene, *, parameters=None, grid=4, size=None, views="all", count_fe
     views : {"all", "needed"}
         "needed" keeps only the maps of those measured views in memory that the camera can see; the picture is the
         same. Asks Mitsuba for the camera's rays; not for a `SceneDescription`.
+    environment : str
+        Way in which the scene's environment lights: see :class:`btfref.render.lighting.Lighting`.
+    lights : int, optional
+        Directional lights that stand for the environment; by default as many as it needs for an estimated error of 1 %.
     count_fetches : bool
         Count the texels that the representations fetch: ``meta["fetches"]``, the mean over covered samples.
 
@@ -47,13 +61,14 @@ def realtime(scene, *, parameters=None, grid=4, size=None, views="all", count_fe
         ``meta["frame_ms"]`` is the median time of one frame (one sample a pixel), GPU timer and wall clock
         whichever is longer; ``gl_vendor``, ``gl_renderer``, ``gl_version``; ``negative_fraction``, the share
         of channels below zero, and ``not_finite``, their number: nothing is clamped; ``resident_views``, the number
-        of views kept by file.
+        of views kept by file. With an environment ``environment_path``, the way taken, and what it says of itself,
+        such as ``environment_lights`` and their ``estimated_error``; by file where there are several.
 
     Raises
     ------
     InputError
         For a scene that cannot be read (see :func:`btfref.render.scene.read_scene`), without lights, with a shape
-        that has no BTF, or with an environment and a method without a prefiltered path.
+        that has no BTF, or with a way to light by the environment that a method lacks.
     MissingDependencyError
         Without an OpenGL driver.
     """
@@ -72,7 +87,9 @@ def realtime(scene, *, parameters=None, grid=4, size=None, views="all", count_fe
     def load_needed(path):
         return representations.load(path, views=needed[path])
 
-    with Renderer(scene, load_needed if needed else None, count_fetches=count_fetches) as renderer:
+    lighting = None if scene.environment is None else Lighting(scene.environment, environment, lights=lights)
+    load_file = load_needed if needed else None
+    with Renderer(scene, load_file, lighting=lighting, count_fetches=count_fetches) as renderer:
         offsets = [((i + 0.5) / grid, (j + 0.5) / grid) for j in range(grid) for i in range(grid)]
         total = np.zeros((scene.camera.height, scene.camera.width, 3))
         times, fetches = [], []
@@ -93,6 +110,7 @@ def realtime(scene, *, parameters=None, grid=4, size=None, views="all", count_fe
             "lights": len(scene.lights),
             "environment": scene.environment.name if scene.environment else None,
             "resident_views": {name: len(kept) for name, kept in needed.items()} if needed else None,
+            **renderer.environment_facts,
             **gl.facts(renderer.ctx),
         }
         if count_fetches:
@@ -114,11 +132,13 @@ class Renderer:
     scene : SceneDescription
     load_file : callable, optional
         ``path -> Representation``; the default reads the files.
+    lighting : btfref.render.lighting.Lighting, optional
+        Of the scene's environment; default: "auto".
     count_fetches : bool
         Have :meth:`fetches` tell the texels fetched; a little slower.
     """
 
-    def __init__(self, scene, load_file=None, *, count_fetches=False):
+    def __init__(self, scene, load_file=None, *, lighting=None, count_fetches=False):
         if not scene.lights and scene.environment is None:
             raise InputError("the scene has no light", file=scene.source, field="emitter")
         for mesh in scene.meshes:
@@ -143,7 +163,10 @@ class Renderer:
         self._target = self._own(self.ctx.framebuffer([colour], self._own(self.ctx.depth_renderbuffer(size))))
         self._near, self._far = _clip(self.camera, scene.meshes)
         self._lights = _light_uniforms(scene.lights) if scene.lights else {}
-        self._n_lights, self._environment = len(scene.lights), scene.environment
+        self._n_lights, self._lighting = len(scene.lights), lighting
+        if lighting is None and scene.environment is not None:
+            self._lighting = Lighting(scene.environment)
+        self._light_facts = {}
         self._counting = {"COUNT_FETCHES": 1} if count_fetches else {}
         try:
             for mesh in scene.meshes:
@@ -167,11 +190,12 @@ class Renderer:
         key = (material.filename, material.filter_type)
         if key not in self._shown:
             rep = load_file(material.filename)
-            if self._environment is not None:
-                # The file's name belongs to the message that the method cannot do this.
-                image_light(rep.meta["method"], file=material.filename)
+            light = None
+            if self._lighting is not None:
+                light = self._lighting.prepared(rep, file=material.filename)
+                self._light_facts[material.filename] = {"environment_path": light.path, **light.facts}
             shown = gl.ShaderRepresentation.upload(
-                self.ctx, rep, filter_type=material.filter_type, environment=self._environment
+                self.ctx, rep, filter_type=material.filter_type, light=light
             )
             defines = {"N_LIGHTS": self._n_lights, **self._counting}
             program = shown.program(self.ctx, "hosts/mesh.vert", "hosts/mesh.frag", defines=defines)
@@ -227,6 +251,13 @@ class Renderer:
                 vertices.render(ctx.TRIANGLES, vertices=3 * len(mesh.faces))
         ctx.finish()
         return max(1e-6 * query.elapsed, 1e3 * (time.perf_counter() - start))
+
+    @property
+    def environment_facts(self):
+        """How the environment lights: the facts of one file, or facts by file where there are several."""
+        if len(self._light_facts) == 1:
+            return next(iter(self._light_facts.values()))
+        return {"environment_path": dict(self._light_facts)} if self._light_facts else {}
 
     def read(self):
         """The frame, float32 (H, W, 3), row 0 at the top."""

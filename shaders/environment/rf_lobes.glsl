@@ -5,7 +5,7 @@
 #include "lib/environment.glsl"
 
 // to_world takes local directions to world space.
-vec3 btf_environment(vec2 uv, vec3 w_view, mat3 to_world) {
+vec3 btf_environment(vec2 uv, vec3 w_view, mat3 to_world, float lod) {
     if (!directions_valid(w_view, w_view)) {
         return vec3(0.0);
     }

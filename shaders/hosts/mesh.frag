@@ -6,6 +6,7 @@
 #include "lib/lod.glsl"
 #include "lib/triangle_table.glsl"
 #include "representation"
+#include "environment"
 
 uniform sampler2DArray triangles;
 uniform vec3 camera_origin;
@@ -53,7 +54,7 @@ void main() {
 #ifdef HAS_ENVIRONMENT
     mat3 to_world = transpose(to_local);
     to_world[2] *= side;
-    sum += btf_environment(uv, w_view, to_world);
+    sum += btf_environment(uv, w_view, to_world, lod);
 #endif
 #ifdef COUNT_FETCHES
     // Instead of coverage: the texels that the representation fetched.

@@ -14,12 +14,14 @@ from btfref.compare.tolerances import tolerance
 from btfref.platform import shader_directory
 from btfref.registry import image_light, methods
 from btfref.render import composer, gl
+from btfref.render.approximate import approximate
 from btfref.render.classes import pixel_classes
 from btfref.render.environment import Environment, bright_texel, constant
 from btfref.render.image_light import radiance
+from btfref.render.lighting import Lighting
 from btfref.render.probe import probe_environment
 from btfref.render.realtime import realtime
-from btfref.render.reference import film_rays, loaded, render
+from btfref.render.reference import render
 from btfref.render.scene import read_scene
 
 KEYS = [key for key, row in methods().items() if row.image_light]
@@ -71,7 +73,7 @@ def test_shader_agrees_with_float64(fits, tables, monkeypatch, rng, key, name):
     monkeypatch.setattr(image_light(key), "tables", classmethod(lambda *_: own))
     points = lookups(rng)
     found = agreement(
-        probe_environment(rep, environment, *points),
+        probe_environment(rep, Lighting(environment).prepared(rep), *points),
         radiance(rep, own, *points),
         gate="environment.agreement",
     )
@@ -100,7 +102,7 @@ def test_injected_faults_are_caught(fits, tables, monkeypatch, rng, tmp_path, na
     monkeypatch.setattr(gl, "shader_file", lambda rep: (shipped[0], [tmp_path, *shipped[1]]))
     points = lookups(rng)
     found = agreement(
-        probe_environment(rep, environment, *points),
+        probe_environment(rep, Lighting(environment).prepared(rep), *points),
         radiance(rep, own, *points),
         gate="environment.agreement",
     )
@@ -121,20 +123,6 @@ def test_a_constant_environment_is_the_albedo(fits, tables, rng, key):
     assert np.abs(difference).max() <= tolerance("environment.albedo.max") * expected.max()
 
 
-def definition(path, parameters, own, rep):
-    """The picture that float64 gives for the rays of the camera, one a pixel; zero where nothing is hit."""
-    with loaded(path, parameters, size=SIZE) as scene:
-        ray, _ = film_rays(scene.sensors()[0], (0.5, 0.5))
-        si = scene.ray_intersect(ray)
-        hit = np.array(si.is_valid())
-        tiling = float(parameters["tiling"])
-        uv, w_view = np.array(si.uv).T * tiling, np.array(si.wi).T
-        axes = [np.array(axis).T for axis in (si.sh_frame.s, si.sh_frame.t, si.sh_frame.n)]
-    value = np.zeros((len(hit), 3))
-    value[hit] = radiance(rep, own, uv[hit], w_view[hit], np.stack(axes, 2)[hit])
-    return value.reshape(*SIZE[::-1], 3)
-
-
 @pytest.fixture
 def under_sky(need, fits, tmp_path):
     """``under_sky(key)``: parameters of a sphere under the smooth sky."""
@@ -151,12 +139,12 @@ def test_pictures_equal_float64(under_sky, fits, tables, monkeypatch, key):
     _, own = tables(key, fits(key), "sky")
     monkeypatch.setattr(image_light(key), "tables", classmethod(lambda *_: own))
     classes = pixel_classes(SPHERE, parameters=parameters, grid=1, size=SIZE)
-    rep, scene = fits(key), read_scene(SPHERE, parameters, size=SIZE)
-    image = realtime(scene, grid=1)
+    image = realtime(read_scene(SPHERE, parameters, size=SIZE), grid=1)
     assert image.meta["environment"] == "envmap"
+    assert image.meta["environment_path"] == "prefiltered"
     assert (image.image[classes == 1].max(-1) > 0.01).all()
-    exact = definition(SPHERE, parameters, own, rep)
-    found = compare(image, exact.astype(np.float32), classes=classes, gate="image.float64", flip=False)
+    exact = approximate(SPHERE, parameters=parameters, grid=1, size=SIZE)
+    found = compare(image, exact, classes=classes, gate="image.float64", flip=False)
     assert found.passed, [gate.line for gate in found.gates]
 
 
@@ -196,6 +184,7 @@ def test_pictures_are_near_the_path_tracer(under_sky, key):
 
 def test_a_method_without_a_prefiltered_path_is_refused_in_one_line(fits, tmp_path, capsys):
     arguments = ["realtime", "sphere", "-o", str(tmp_path / "x.exr"), "-D", "lights=constant"]
+    arguments += ["--environment", "prefiltered"]
     assert main([*arguments, "-D", f"btf={fits.path('lpca')}"]) == 2
     error = capsys.readouterr().err.strip()
     assert "prefiltered" in error
@@ -234,14 +223,15 @@ def test_glslang_accepts_the_environment_shaders(need, fits, tmp_path, key, targ
     validator = need("glslang")
     rep, light = fits(key), image_light(key)
     own = light.tables(rep, constant(), size=8)
-    shapes = {f"{n}_DIM{axis}".upper(): k for n, table in own.items() for axis, k in enumerate(table.shape)}
     for host, n_lights in (
         ("hosts/mesh.frag", 0),
         ("hosts/mesh.frag", 2),
         ("hosts/probe_environment.vert", 0),
     ):
-        defines = {**gl.shader_defines(rep), **shapes, "HAS_ENVIRONMENT": True, "N_LIGHTS": n_lights}
-        source = composer.compose(host, defines, representation=light.SHADER, target=target)
+        defines = {**gl.shader_defines(rep), **gl.light_defines(own), "N_LIGHTS": n_lights}
+        shader, directories = gl.shader_file(rep)
+        settings = {"representation": shader, "environment": light.SHADER, "directories": directories}
+        source = composer.compose(host, defines, target=target, **settings)
         path = tmp_path / host.replace("/", "_")
         path.write_text(source, encoding="utf-8")
         done = subprocess.run([validator, str(path)], capture_output=True, text=True, check=False)

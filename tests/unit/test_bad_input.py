@@ -261,7 +261,7 @@ def test_bad_arguments(arguments, words, folder, capsys):
 @pytest.mark.parametrize(
     ("parts", "words"),
     [
-        ({"light": '<emitter type="constant"/>'}, ["onstant"]),
+        ({"light": '<emitter type="sunsky"/>'}, ["unsky"]),
         ({"light": '<emitter type="nonsense"/>'}, ["nonsense"]),
         ({"sensor": ""}, ["sensor"]),
         ({"shape": '<shape type="ply"><string name="filename" value="none.ply"/></shape>'}, ["none.ply"]),

@@ -1,0 +1,130 @@
+"""The real-time picture in float64: the same approximation, at the same samples, by NumPy.
+
+What GLSL shows differs from it by float32 rounding alone; what the path tracer shows differs from it by the
+approximation's own error. Primary hits are Mitsuba's; everything behind them is the definition.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from btfref import representations
+from btfref.errors import InputError
+from btfref.numerics.footprint import ANISOTROPY, probe_weight
+from btfref.render.lighting import Lighting
+from btfref.render.result import RenderResult
+from btfref.render.scene import read_scene
+from btfref.render.visible import visible_points
+
+
+def approximate(scene, *, parameters=None, path="auto", grid=4, size=None, lights=None):
+    """What :func:`btfref.render.realtime.realtime` approximates, evaluated in float64.
+
+    Parameters
+    ----------
+    scene : path-like or dict
+    parameters : dict of str to str, optional
+        Values for ``$name`` in the file.
+    path : str
+        Way in which an environment lights, as ``environment`` of ``realtime``.
+    grid : int
+        n of the n × n sub-pixel samples, at (i + ½)/n.
+    size : (int, int), optional
+        Width and height in place of the scene's.
+    lights : int, optional
+        As for ``realtime``.
+
+    Returns
+    -------
+    RenderResult
+        Without cast shadows, on black. ``meta`` as of ``realtime``: ``environment_path`` and its facts.
+
+    Raises
+    ------
+    InputError
+        As ``realtime``.
+    MissingDependencyError
+        Without a usable LLVM.
+    """
+    if grid < 1:
+        raise InputError("the sub-pixel grid needs a sample", field="grid", got=grid, expected="≥ 1")
+    description = read_scene(scene, parameters, size=size)
+    if not description.lights and description.environment is None:
+        raise InputError("the scene has no light", file=description.source, field="emitter")
+    lighting = None
+    if description.environment is not None:
+        lighting = Lighting(description.environment, path, lights=lights)
+    start = time.perf_counter()
+    reps, prepared, total = {}, {}, None
+    for points in visible_points(scene, description, parameters=parameters, size=size, grid=grid):
+        if total is None:
+            total = np.zeros((points.shape[0] * points.shape[1], 3))
+        name = points.material.filename
+        if name not in reps:
+            reps[name] = representations.load(name)
+            if lighting is not None:
+                prepared[name] = lighting.prepared(reps[name], file=name)
+        rep = _filtered(reps[name], points.material.filter_type)
+        value = _radiance(rep, points, description.lights, prepared.get(name))
+        total[points.pixel] += points.material.scale * value
+    camera = description.camera
+    if total is None:
+        total = np.zeros((camera.height * camera.width, 3))
+    image = (total / grid**2).reshape(camera.height, camera.width, 3)
+    facts = [{"environment_path": p.path, **p.facts} for p in prepared.values()]
+    meta = {
+        "renderer": "approximate",
+        "grid": grid,
+        "shadows": False,
+        "environment": description.environment.name if description.environment else None,
+        "seconds": time.perf_counter() - start,
+    }
+    if len(facts) == 1:
+        meta |= facts[0]
+    elif facts:
+        meta["environment_path"] = dict(zip(prepared, facts, strict=True))
+    return RenderResult(image.astype(np.float32), None, meta)
+
+
+def _filtered(representation, filter_type):
+    """The representation with the material's texel filter."""
+    if filter_type in (None, representation.meta["filter_type"]):
+        return representation
+    meta = {**representation.meta, "filter_type": filter_type}
+    return type(representation).from_arrays(representation.arrays(), meta)
+
+
+def _radiance(representation, points, lights, prepared):
+    """Radiance towards the viewer without the material's factor, shape (N, 3)."""
+
+    def evaluate(uv, w_light, w_view, at):
+        if points.footprint is None or not hasattr(representation, "max_lod"):
+            return representation.evaluate(uv, w_light, w_view)
+        lod, step, ratio = (a[at] for a in points.footprint)
+        value = np.zeros((len(uv), 3))
+        reach = int((ANISOTROPY - 1) / 2)
+        for j in range(-reach, reach + 1):
+            share = probe_weight(j, ratio)
+            some = np.flatnonzero(share > 0)
+            if len(some):
+                found = representation.evaluate(
+                    uv[some] + j * step[some], w_light[some], w_view[some], lod=lod[some]
+                )
+                value[some] += share[some, None] * found
+        return value
+
+    everywhere, total = np.arange(len(points.uv)), np.zeros((len(points.uv), 3))
+    for light in lights:
+        towards, power = light.position - points.position, light.power
+        if light.kind == "directional":
+            towards = np.broadcast_to(light.position, points.position.shape)
+        else:
+            square = (towards**2).sum(1, keepdims=True)
+            towards, power = towards / np.sqrt(square), power / square
+        w_light = np.einsum("ni,nij->nj", towards, points.to_world)
+        total += power * evaluate(points.uv, w_light, points.w_view, everywhere)
+    if prepared is not None:
+        total += prepared.radiance(points.uv, points.w_view, points.to_world, evaluate)
+    return total

@@ -1,0 +1,19 @@
+// Provides btf_environment of any representation: radiance under the directional lights that stand for an environment.
+// Expects the representation's btf_eval and environment_lights [light, 2, 4]: direction towards it, irradiance.
+
+#include "lib/table.glsl"
+
+uniform sampler2DArray environment_lights;
+
+// to_world takes local directions to world space.
+vec3 btf_environment(vec2 uv, vec3 w_view, mat3 to_world, float lod) {
+    vec3 sum = vec3(0.0);
+    for (int i = 0; i < ENVIRONMENT_LIGHTS_DIM0; ++i) {
+        // A row vector times the matrix: the transpose takes the world's directions to local ones.
+        vec3 w_light = table_fetch(environment_lights, 2 * i).xyz * to_world;
+        if (w_light.z > 0.0) {
+            sum += table_fetch(environment_lights, 2 * i + 1).rgb * btf_eval(uv, w_light, w_view, lod);
+        }
+    }
+    return sum;
+}
