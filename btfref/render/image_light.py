@@ -2,7 +2,8 @@
 
 Source: Meseth, Müller, Klein 2004, section 5.2. Differs from it in the foreshortening: their lobes multiply (n · l),
 approximated by (n · t); ours hold it. What lies below the local horizon, which a lobe over the sphere sees and the BTF
-does not, is taken out by a share that is exact in a constant environment.
+does not, is cut off: the rest is looked up as the lobe that has its integral and its centroid
+(:func:`btfref.render.prefilter.clipped_lobes`).
 
 A class a method, found by the registry: ``SHADER`` provides ``btf_environment``, ``tables`` what it reads, and
 ``radiance`` the same in float64, from the same tables.
@@ -29,9 +30,7 @@ class _PrefilteredLobes:
     cosine = False
 
     @classmethod
-    def tables(
-        cls, representation, environment, *, size=prefilter.SIZE, slices=prefilter.SLICES, horizon=True
-    ):
+    def tables(cls, representation, environment, *, size=prefilter.SIZE, slices=prefilter.SLICES):
         """Maps of the environment.
 
         Parameters
@@ -42,19 +41,16 @@ class _PrefilteredLobes:
             Texels a side of a parabolic map.
         slices : int
             Sampled exponents 2^(i/2), at least 2.
-        horizon : bool
-            False leaves lobes whole, below the horizon as well.
 
         Returns
         -------
         dict of str to ndarray of float32
-            ``environment_maps`` [2 slices, size, size, 3], ``horizon_shares`` [slices, heights, 1].
+            ``environment_maps`` [2 slices, size, size, 3], ``clipped_lobes`` [slices, heights, 4].
         """
         edge = representation.meta["constants"]["light_edge"]
-        shares = prefilter.horizon_shares(edge, cosine=cls.cosine, slices=slices)
         return {
             "environment_maps": prefilter.lobe_maps(environment, size=size, slices=slices),
-            "horizon_shares": (shares if horizon else np.ones_like(shares))[..., None],
+            "clipped_lobes": prefilter.clipped_lobes(edge, cosine=cls.cosine, slices=slices),
         }
 
 
@@ -69,14 +65,13 @@ class Lobes(_PrefilteredLobes):
         lobes = representation.maps["lobes"]
         lobes = lobes.reshape(-1, lobes.shape[2], lobes.shape[3] // 4, 4)
         colour = representation.maps["colour"].reshape(-1, 4).astype(float)
-        maps, shares = tables["environment_maps"], tables["horizon_shares"][..., 0]
+        maps, clipped = tables["environment_maps"], tables["clipped_lobes"]
 
         def kernel(texel, view, w_view, frame):
             at = lobes[texel[0][:, :, None], view[0][:, None, :]].astype(float)
             s, t, exponent, peak = np.moveaxis(at, -1, 0)
-            axis = parabolic_axis(s, t)
-            world = np.einsum("nij,ntvkj->ntvki", frame, axis)
-            lobe = prefilter.lobe_lookup(maps, shares, world, axis[..., 2], np.maximum(exponent, 1))
+            axis, to_world = parabolic_axis(s, t), frame[:, None, None, None]
+            lobe = prefilter.lobe_lookup(maps, clipped, axis, to_world, np.maximum(exponent, 1))
             value = np.einsum("ntvk,ntvkc,nv->ntc", peak, lobe, view[1])
             value += colour[texel[0]][..., 3:] * _irradiance(maps, frame)[:, None]
             return np.einsum("nt,ntc,ntc->nc", texel[1], value, colour[texel[0]][..., :3])
@@ -94,7 +89,7 @@ class Lafortune(_PrefilteredLobes):
     def radiance(cls, representation, tables, uv, w_view, to_world):
         """See :func:`radiance`."""
         flat = flat_maps(representation.maps)
-        maps, shares = tables["environment_maps"], tables["horizon_shares"][..., 0]
+        maps, clipped = tables["environment_maps"], tables["clipped_lobes"]
         edge = representation.meta["constants"]["view_edge"]
 
         def kernel(texel, view, w_view, frame):
@@ -102,8 +97,8 @@ class Lafortune(_PrefilteredLobes):
             t = lobes[..., :3] * held(w_view, edge)[0][:, None, None]
             size, exponent = np.linalg.norm(t, axis=-1), lobes[..., 3]
             axis = t / np.maximum(size, FLOOR)[..., None]
-            world = np.einsum("nij,ntkj->ntki", frame, axis)
-            lobe = prefilter.lobe_lookup(maps, shares, world, axis[..., 2], np.maximum(exponent, 1))
+            to_world = frame[:, None, None]
+            lobe = prefilter.lobe_lookup(maps, clipped, axis, to_world, np.maximum(exponent, 1))
             value = np.einsum("ntk,ntkc->ntc", flat["peaks"][texel[0]] * safe_power(size, exponent), lobe)
             value += flat["colour"][texel[0]][..., 3:] * _irradiance(maps, frame)[:, None]
             if "factor" in flat:

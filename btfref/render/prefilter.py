@@ -25,7 +25,7 @@ SIZE = 64
 #: Directions filtered at a time: their products with the cells stay in the cache.
 BLOCK = 64
 
-#: Values of the axis' height above the horizon, from −1 to 1, in a table of horizon shares.
+#: Values of the axis' height above the horizon, from −1 to 1, in a table of clipped lobes.
 HEIGHTS = 128
 
 
@@ -133,8 +133,13 @@ def moment_maps(environment, edge, *, size=SIZE):
     return result.reshape(18, size, size, 3).astype(np.float32)
 
 
-def horizon_shares(edge, *, cosine, slices=SLICES, heights=HEIGHTS):
-    """What is left of a lobe above the horizon, where lights below it count for nothing and those near it fade.
+def clipped_lobes(edge, *, cosine, slices=SLICES, heights=HEIGHTS):
+    """The cosine lobes that stand for lobes cut by the horizon, where lights near it fade.
+
+    A lobe about an axis ``a`` loses what is below the surface's horizon. What is left is taken as a share of a whole
+    lobe again, with the same integral and the same first moment: its axis is the centroid's direction, and its
+    exponent follows from the centroid's length R, which is ``(n + 1) / (n + 2)`` for a whole lobe. So constant
+    environments come out exactly, and those that are linear in the direction too.
 
     Parameters
     ----------
@@ -146,9 +151,11 @@ def horizon_shares(edge, *, cosine, slices=SLICES, heights=HEIGHTS):
 
     Returns
     -------
-    ndarray of float32, shape (slices, heights)
-        By exponent and height ``a_z`` of the axis, from −1 to 1: the ratio of the lobe's integral over the hemisphere,
-        held and faded, to that over the sphere. With it, lobes are exact in a constant environment.
+    ndarray of float32, shape (slices, heights, 4)
+        By exponent and height ``a_z`` of the axis, from −1 to 1: the integral over the hemisphere, held and faded, over
+        that of the lobe over the sphere; what the axis' horizontal part is multiplied by, and what its height becomes;
+        the position of the new exponent, ``2 log2 n``, at least 0. The factor is smooth at the pole, where an angle
+        would be the root of a difference.
     """
     # Gauss–Legendre in the height on both sides of the edge, equal steps in the azimuth.
     nodes, weights = np.polynomial.legendre.leggauss(48)
@@ -158,14 +165,28 @@ def horizon_shares(edge, *, cosine, slices=SLICES, heights=HEIGHTS):
     phi = (np.arange(256) + 0.5) * (np.pi / 256)
     held = np.maximum(z, edge)
     radius = np.sqrt(1 - held * held)
-    fade = np.where(z < edge, z / max(edge, 1e-30), 1) * (held if cosine else 1)
+    weight = weight * np.where(z < edge, z / max(edge, 1e-30), 1) * (held if cosine else 1)
     a = np.linspace(-1, 1, heights)[:, None, None]
     product = radius[:, None] * np.sqrt(1 - a * a) * np.cos(phi) + held[:, None] * a
     log = np.log(np.maximum(product, FLOOR))
-    result = np.zeros((slices, heights))
+    horizontal = np.sqrt(1 - a.ravel() ** 2)
+    result = np.zeros((slices, heights, 4))
     for i, n in enumerate(exponents(slices)):
-        lobe = np.where(product > FLOOR, np.exp(n * log), 0).mean(-1)
-        result[i] = lobe @ (weight * fade) * (n + 1)
+        lobe = np.where(product > FLOOR, np.exp(n * log), 0)
+        total, along = lobe.mean(-1), (lobe * np.cos(phi)).mean(-1)
+        integral = total @ weight
+        up, across = total @ (weight * z), along @ (weight * np.sqrt(1 - z * z))
+        length = np.hypot(up, across)
+        # A lobe that points straight down has nothing left, and one that points up keeps its direction: both take the
+        # centroid, or the factor, of their neighbour.
+        first = np.argmax(length * horizontal > 0)
+        there = np.clip(np.arange(heights), first, None)
+        r = length[there] / integral[there]
+        exponent = np.maximum((2 * r - 1) / (1 - r), 1)
+        inner = np.clip(there, None, heights - 2)
+        stretch = across[inner] / (length[inner] * horizontal[inner])
+        columns = [integral * (n + 1), stretch, up[there] / length[there], 2 * np.log2(exponent)]
+        result[i] = np.stack(columns, -1)
     return result.astype(np.float32)
 
 
@@ -193,40 +214,50 @@ def map_lookup(maps, index, w):
     return np.einsum("...k,...kc->...c", weight, flat[half[..., None], at].astype(float))
 
 
-def lobe_lookup(maps, shares, axis, height, exponent):
+def lobe_lookup(maps, clipped, axis, to_world, exponent):
     """Integral of ``max(a · l, 0)^n`` times the environment over the hemisphere of a surface.
 
     Parameters
     ----------
     maps : ndarray, shape (2 slices, size, size, channels)
         See :func:`lobe_maps`.
-    shares : ndarray, shape (slices, heights)
-        See :func:`horizon_shares`.
+    clipped : ndarray, shape (slices, heights, 4)
+        See :func:`clipped_lobes`.
     axis : ndarray, shape (..., 3)
-        World space, any length.
-    height : ndarray, shape (...)
-        Component of the unit axis along the surface's normal.
+        Unit vectors in the surface's frame.
+    to_world : ndarray, shape (..., 3, 3)
+        Columns: the frame's axes in world space.
     exponent : ndarray, shape (...)
-        Linear in its logarithm between the sampled ones; beyond the largest, that one's mean radiance is taken.
+        Everything is linear in its logarithm between the sampled ones; beyond the largest, that one's mean radiance
+        is taken.
 
     Returns
     -------
     ndarray of float64, shape (..., channels)
     """
-    slices = len(maps) // 2
-    position = np.clip(2 * np.log2(np.maximum(exponent, 1)), 0, slices - 1)
-    low = np.minimum(position.astype(np.int64), slices - 2)
-    f = position - low
-    mean = (1 - f)[..., None] * map_lookup(maps, low, axis)
-    mean += f[..., None] * map_lookup(maps, low + 1, axis)
-    share = (1 - f) * share_lookup(shares, low, height) + f * share_lookup(shares, low + 1, height)
+    low, f = _between(2 * np.log2(np.maximum(exponent, 1)), len(clipped))
+    f = f[..., None]
+    height = axis[..., 2]
+    share, stretch, z, position = np.moveaxis(
+        (1 - f) * clipped_lookup(clipped, low, height) + f * clipped_lookup(clipped, low + 1, height), -1, 0
+    )
+    moved = np.concatenate([axis[..., :2] * stretch[..., None], z[..., None]], -1)
+    world = np.einsum("...ij,...j->...i", to_world, moved)
+    low, f = _between(position, len(maps) // 2)
+    f = f[..., None]
+    mean = (1 - f) * map_lookup(maps, low, world) + f * map_lookup(maps, low + 1, world)
     return (2 * np.pi / (exponent + 1) * share)[..., None] * mean
 
 
-def share_lookup(shares, index, height):
-    """Linear lookup in a row of a table of horizon shares."""
-    last = shares.shape[1] - 1
-    position = np.clip((height + 1) * (last / 2), 0, last)
-    low = np.minimum(position.astype(np.int64), last - 1)
-    f = position - low
-    return (1 - f) * shares[index, low].astype(float) + f * shares[index, low + 1].astype(float)
+def clipped_lookup(clipped, index, height):
+    """Linear lookup in a row of a table of :func:`clipped_lobes`, shape (...) -> (..., 4)."""
+    low, f = _between((height + 1) * ((clipped.shape[1] - 1) / 2), clipped.shape[1])
+    f = f[..., None]
+    return (1 - f) * clipped[index, low].astype(float) + f * clipped[index, low + 1].astype(float)
+
+
+def _between(position, count):
+    """The lower of two of ``count`` samples about a position, held at the ends, and the share of the upper one."""
+    position = np.clip(position, 0, count - 1)
+    low = np.minimum(position.astype(np.int64), count - 2)
+    return low, position - low

@@ -28,7 +28,7 @@ vec3 btf_environment(vec2 uv, vec3 w_view, mat3 to_world, float lod) {
                 vec4 lobe = table_fetch(lobes, at + j);
                 vec3 axis = parabolic_axis(lobe.xy);
                 // The data hold the light's cosine, and so do the lobes: the paper's (n . t) is not needed.
-                value += views.weight[v] * lobe.w * environment_lobe(to_world * axis, axis.z, lobe.z);
+                value += views.weight[v] * lobe.w * environment_lobe(axis, to_world, lobe.z);
             }
         }
         sum += texels.weight[x] * own.rgb * value;

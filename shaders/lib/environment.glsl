@@ -1,35 +1,40 @@
 // Provides environment_lobe, environment_irradiance: a prefiltered environment, as btfref/render/prefilter.py makes it.
-// Expects environment_maps [2 slices, size, size, 3] and horizon_shares [slices, heights, 1].
+// Expects environment_maps [2 slices, size, size, 3] and clipped_lobes [slices, heights, 4].
 
 #include "lib/powers.glsl"
 #include "lib/sphere_maps.glsl"
 
 uniform sampler2DArray environment_maps;
-uniform sampler2DArray horizon_shares;
+uniform sampler2DArray clipped_lobes;
 
 const float ENVIRONMENT_PI = 3.14159265358979;
 
-// Share of a lobe above the horizon; height is that of its axis.
-float horizon_share(int slice, float height) {
-    const int last = HORIZON_SHARES_DIM1 - 1;
+// What stands for a lobe that the horizon cuts: its share, the factor of its axis' horizontal part, the axis' height, the
+// position of its exponent.
+vec4 clipped_lobe(int slice, float height) {
+    const int last = CLIPPED_LOBES_DIM1 - 1;
     float position = clamp((height + 1.0) * (0.5 * float(last)), 0.0, float(last));
     int low = min(int(position), last - 1);
-    int at = slice * HORIZON_SHARES_DIM1 + low;
-    return mix(table_fetch(horizon_shares, at).r, table_fetch(horizon_shares, at + 1).r, position - float(low));
+    int at = slice * CLIPPED_LOBES_DIM1 + low;
+    return mix(table_fetch(clipped_lobes, at), table_fetch(clipped_lobes, at + 1), position - float(low));
 }
 
-// Integral of max(axis . l, 0)^exponent L(l) over the hemisphere (Meseth, Mueller, Klein 2004, section 5.2): linear in
-// the logarithm of the exponent between the slices, which are at 2^(i/2).
-vec3 environment_lobe(vec3 axis, float height, float exponent) {
+// Integral of max(axis . l, 0)^exponent L(l) over the hemisphere (Meseth, Mueller, Klein 2004, section 5.2), the axis in
+// the frame that to_world takes to world space. Linear in the logarithm of the exponent between the slices, which are
+// at 2^(i/2).
+vec3 environment_lobe(vec3 axis, mat3 to_world, float exponent) {
     const int slices = ENVIRONMENT_MAPS_DIM0 / 2;
     float n = max(exponent, 1.0);
     float position = clamp(2.0 * log2_accurate(n), 0.0, float(slices - 1));
     int low = min(int(position), slices - 2);
+    vec4 lobe = mix(clipped_lobe(low, axis.z), clipped_lobe(low + 1, axis.z), position - float(low));
+    vec3 moved = to_world * vec3(axis.xy * lobe.y, lobe.z);
+    position = clamp(lobe.w, 0.0, float(slices - 1));
+    low = min(int(position), slices - 2);
     float f = position - float(low);
-    vec3 mean = mix(sphere_lookup(environment_maps, low, ENVIRONMENT_MAPS_DIM1, axis),
-                    sphere_lookup(environment_maps, low + 1, ENVIRONMENT_MAPS_DIM1, axis), f);
-    float share = mix(horizon_share(low, height), horizon_share(low + 1, height), f);
-    return (2.0 * ENVIRONMENT_PI / (n + 1.0) * share) * mean;
+    vec3 mean = mix(sphere_lookup(environment_maps, low, ENVIRONMENT_MAPS_DIM1, moved),
+                    sphere_lookup(environment_maps, low + 1, ENVIRONMENT_MAPS_DIM1, moved), f);
+    return (2.0 * ENVIRONMENT_PI / (n + 1.0) * lobe.x) * mean;
 }
 
 // Irradiance of a surface: the first slice is the cosine.

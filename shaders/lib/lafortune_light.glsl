@@ -13,7 +13,7 @@ vec3 lafortune_light(int texel, float diffuse, vec3 view, mat3 to_world) {
         vec3 t = lobe.xyz * view;
         float size = length(t);
         vec3 axis = t / max(size, POWER_FLOOR);
-        value += peak * safe_power(size, lobe.w) * environment_lobe(to_world * axis, axis.z, lobe.w);
+        value += peak * safe_power(size, lobe.w) * environment_lobe(axis, to_world, lobe.w);
     }
     return value;
 }

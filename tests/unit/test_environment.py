@@ -9,6 +9,7 @@ from btfref.numerics.quadrature import gauss_hemisphere
 from btfref.registry import image_light, methods
 from btfref.render import prefilter
 from btfref.render.environment import Environment, bright_texel, constant, from_emitter, sunsky
+from btfref.representations.analytic import held
 
 SMALL = {"size": 32}
 
@@ -109,13 +110,34 @@ def test_moments_of_a_constant_environment(rng):
 def test_shares_above_the_horizon():
     n = prefilter.exponents()
     for cosine, upright in ((False, np.ones_like(n)), (True, (n + 1) / (n + 2))):
-        shares = prefilter.horizon_shares(0.0, cosine=cosine)
+        shares = prefilter.clipped_lobes(0.0, cosine=cosine)[..., 0]
         assert np.abs(shares[:, -1] - upright).max() <= tolerance("environment.shares.max")
         assert np.abs(shares[:, 0]).max() <= tolerance("environment.shares.max")
         assert (np.diff(shares, axis=1) >= -tolerance("environment.shares.max")).all()
     # Half of a lobe along the horizon is above it: heights are symmetric about 0.
-    half = prefilter.horizon_shares(0.0, cosine=False)
+    half = prefilter.clipped_lobes(0.0, cosine=False)[..., 0]
     assert np.abs(half + half[:, ::-1] - 1).max() <= tolerance("environment.shares.max")
+
+
+@pytest.mark.parametrize("cosine", [False, True])
+@pytest.mark.parametrize("edge", [0.0, 0.26])
+def test_clipped_lobes_keep_their_first_moment(rng, edge, cosine):
+    """Environments linear in the direction come out exactly: against quadrature over the hemisphere."""
+    w, weight = gauss_hemisphere(96, 192)
+    raised, fade = held(w, edge)
+    weight = weight * fade * (raised[:, 2] if cosine else 1)
+    clipped = prefilter.clipped_lobes(edge, cosine=cosine)
+    axis = random_directions(rng, 200)
+    axis = axis[axis[:, 2] > -0.8]
+    exponent = 2 ** rng.uniform(0, 5, len(axis))
+    expected = np.maximum(axis @ raised.T, 0) ** exponent[:, None] * weight @ w
+    # Maps of the environments x, y, z: the mean of a lobe is its axis times (n + 1) / (n + 2).
+    share = (prefilter.exponents() + 1) / (prefilter.exponents() + 2)
+    maps = np.repeat(share, 2)[:, None, None, None] * np.tile(prefilter.map_directions(), (11, 1, 1, 1))
+    found = prefilter.lobe_lookup(maps, clipped, axis, np.eye(3), exponent)
+    assert (
+        np.abs(found - expected).max() <= tolerance("environment.first_moment.max") * np.abs(expected).max()
+    )
 
 
 def test_sun_and_sky(need):
