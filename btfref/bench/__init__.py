@@ -1,17 +1,19 @@
-"""Run time against error: suites of benchmarks, each a function that returns its raw times and its summary."""
+"""Run time against error: plans (TOML) over all methods, and suites of their own for what no plan can say.
+
+A plan is run by :mod:`btfref.bench.matrix`. A suite is a module with ``run(*, quick, progress, btf, only) -> dict`` and
+``table(result) -> header, rows``.
+"""
 
 from __future__ import annotations
 
-#: Suites by name: module with ``run(*, quick, progress, btf, only) -> dict`` and ``table(result) -> rows``.
+#: Suites by name.
 SUITES = {
     "environment": "btfref.bench.environment",
     "factors": "btfref.bench.factors",
-    "fit": "btfref.bench.fit",
     "gbrdf": "btfref.bench.gbrdf",
     "lobes": "btfref.bench.lobes",
     "lod": "btfref.bench.lod",
     "pyramid": "btfref.bench.pyramid",
     "reflectance": "btfref.bench.reflectance",
-    "render": "btfref.bench.render",
     "synth": "btfref.bench.synth",
 }

@@ -1,6 +1,9 @@
-"""Measure run time, and error beside it, of one suite of benchmarks.
+"""Measure run time, and error beside it.
 
-Times are medians of interleaved rounds after a warm-up; ratios are medians of paired rounds.
+A plan (a shipped one by its name, or a file NAME.toml) measures methods and their peers and keeps raw results; a suite
+answers one question of one method. "report" makes tables and diagrams of the results of plans, "compare" sets two
+folders of results side by side. Times are medians of interleaved rounds after a warm-up; ratios are medians of paired
+rounds.
 """
 
 from __future__ import annotations
@@ -8,26 +11,124 @@ from __future__ import annotations
 from pathlib import Path
 
 from btfref.bench import SUITES
+from btfref.bench.plan import SUFFIX, shipped
 from btfref.commands._shared import Progress, emit, emit_json, output_file, table
 from btfref.errors import InputError
+
+#: Words in the place of a suite that read results instead.
+READERS = ("compare", "report")
 
 
 def add_arguments(parser):
     """Describe the command's arguments."""
-    parser.add_argument("suite", choices=sorted(SUITES), help="what to measure")
-    parser.add_argument("--quick", action="store_true", help="fewer rounds")
+    plans, suites = ", ".join(shipped()), ", ".join(sorted(SUITES))
+    parser.add_argument(
+        "suite", metavar="WHAT", help=f"a plan ({plans}, or FILE.toml), a suite ({suites}), report or compare"
+    )
+    parser.add_argument("folders", nargs="*", metavar="FOLDER", help="results, for report and compare")
+    parser.add_argument("--quick", action="store_true", help="less data or fewer rounds")
     parser.add_argument("--btf", metavar="BTF", help="a sampled BTF (.btf.zarr) instead of the suite's own")
     parser.add_argument("--only", metavar="METHOD[,METHOD]", help="these methods instead of all")
-    parser.add_argument("-o", "--output", metavar="FILE.jsonl", help="append the raw result as one JSON line")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="FOLDER|FILE.jsonl",
+        help="raw results: a folder for plans (and for the report), a file to append a line to for suites",
+    )
     parser.add_argument("--plot", metavar="FILE.png", help="draw how the cost grows (suite synth)")
     parser.add_argument(
         "--report", metavar="FILE.html", help="a page with the pictures, of suites that have any"
     )
-    parser.add_argument("--json", action="store_true", help="print the raw result as JSON")
+    parser.add_argument("--json", action="store_true", help="print metrics or the raw result as JSON")
 
 
 def run(args):
     """Carry the command out."""
+    if args.suite in READERS:
+        return _compare(args) if args.suite == "compare" else _report(args)
+    if args.folders:
+        raise InputError("folders are for report and compare", field="FOLDER", got=args.folders[0])
+    if args.suite in shipped() or args.suite.endswith(SUFFIX):
+        return _plan(args)
+    if args.suite in SUITES:
+        return _suite(args)
+    known = ", ".join([*shipped(), *sorted(SUITES), *READERS])
+    raise InputError("no such plan or suite", field="WHAT", got=args.suite, expected=known)
+
+
+def _plan(args):
+    import tempfile
+
+    from btfref.bench.matrix import run as run_plan
+    from btfref.bench.metrics import read_records, rows
+    from btfref.bench.plan import read_plan
+    from btfref.bench.tables import tables
+
+    if args.plot or args.report:
+        raise InputError("diagrams of plans are made by: btfref bench report FOLDER", field="--report")
+    plan = read_plan(shipped().get(args.suite, args.suite), quick=args.quick, only=_only(args))
+    with tempfile.TemporaryDirectory() as scratch, Progress() as progress:
+        folder = Path(args.output or scratch)
+        number = run_plan(plan, folder, btf=_btf(args), progress=progress)
+        records = [r for r in read_records(folder) if number in (r.get("run"), r.get("id"))]
+        found = rows(folder, records)
+    if args.json:
+        emit_json({"run": records[0], "metrics": found})
+        return 0
+    for title, header, lines in tables(found):
+        emit(title)
+        for line in table(lines, header=header):
+            emit(line)
+        emit()
+    return 0
+
+
+def _report(args):
+    import json
+
+    from btfref.bench.tables import markdown, panels, summary, tables
+    from btfref.report.pareto import draw_pareto, pareto_table
+
+    if len(args.folders) != 1 or not args.output:
+        raise InputError("report needs one folder of results, and -o FOLDER", field="FOLDER")
+    made = summary(args.folders[0])
+    out = Path(args.output)
+    out.mkdir(parents=True, exist_ok=True)
+    lines = []
+    for title, header, rows in tables(made["metrics"]):
+        lines += markdown(title, header, rows)
+    for material in made["front"]:
+        diagrams = panels(made["metrics"], material)
+        if diagrams:
+            draw_pareto(diagrams, out / f"{material}.png")
+            lines += [f"![{material}]({material}.png)", ""]
+            for diagram in diagrams:
+                lines += [f"**{material}: {diagram.x_label}**", "", *pareto_table(diagram), ""]
+    (out / "tables.md").write_text("\n".join(lines))
+    (out / "summary.json").write_text(json.dumps(made, indent=1))
+    emit(f"{out / 'tables.md'}")
+    return 0
+
+
+def _compare(args):
+    from btfref.bench.tables import compared
+
+    if len(args.folders) != 2:
+        raise InputError("compare needs two folders of results", field="FOLDER", got=len(args.folders))
+    found = compared(*args.folders)
+    if not found:
+        raise InputError("the two have no measurement in common", field="FOLDER", got=" ".join(args.folders))
+    if args.json:
+        emit_json(found)
+        return 0
+    number = lambda x: "–" if x is None else f"{x:.4g}"  # noqa: E731
+    lines = [(r["what"], *(number(r[k]) for k in ("first", "second", "ratio", "low", "high"))) for r in found]
+    for line in table(lines, header=("what", "first", "second", "ratio", "95 % from", "to")):
+        emit(line)
+    return 0
+
+
+def _suite(args):
     import importlib
     import inspect
     import json
@@ -37,15 +138,13 @@ def run(args):
     if plot and args.suite != "synth":
         raise InputError("only the suite synth is drawn", field="--plot", got=args.suite, expected="synth")
     suite = importlib.import_module(SUITES[args.suite])
-    options = {"only": args.only.split(",")} if args.only else {}
+    options = {"only": _only(args)} if args.only else {}
     if args.report:
         options["report"] = output_file(args.report, ".html")
         if "report" not in inspect.signature(suite.run).parameters:
             raise InputError("this suite has no pictures", field="--report", got=args.suite)
     if args.btf:
-        from btfref.sampling import SampledBTF
-
-        options["btf"] = SampledBTF.load(args.btf, variance=False)
+        options["btf"] = _btf(args)
     with Progress() as progress:
         result = suite.run(quick=args.quick, progress=progress, **options)
     if out:
@@ -62,3 +161,15 @@ def run(args):
     for line in table(rows, header=header):
         emit(line)
     return 0
+
+
+def _only(args):
+    return args.only.split(",") if args.only else None
+
+
+def _btf(args):
+    if not args.btf:
+        return None
+    from btfref.sampling import SampledBTF
+
+    return SampledBTF.load(args.btf, variance=False)

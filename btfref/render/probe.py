@@ -32,9 +32,11 @@ def probe(rep, uv, w_light, w_view, lod=0.0, *, filter_type=None):
         Without an OpenGL driver.
     """
     points, _ = broadcast_points(uv, w_light, w_view, lod)
-    names = {"uv": 2, "w_light": 3, "w_view": 3, "lod": 1}
-    tables = gl.ShaderRepresentation.upload(gl.context(), rep, filter_type=filter_type)
-    return _transformed(tables, "hosts/probe.vert", names, points)
+    if not len(points):
+        return np.zeros((0, 3), np.float32)
+    with probe_points(rep, points, filter_type=filter_type) as made:
+        made.run()
+        return made.values()
 
 
 def probe_environment(rep, light, uv, w_view, to_world, *, filter_type=None):
@@ -68,31 +70,76 @@ def probe_environment(rep, light, uv, w_view, to_world, *, filter_type=None):
     return _transformed(tables, "hosts/probe_environment.vert", names, points)
 
 
+class Probe:
+    """A vertex host on the GPU, with points to evaluate: ``value`` of each; a context manager.
+
+    Parameters
+    ----------
+    tables : btfref.render.gl.ShaderRepresentation
+        Owned from here on.
+    host : str
+        Vertex shader that writes ``value``.
+    names : dict of str to int
+        Attributes in the order of the points' columns, and how many columns each has.
+    points : ndarray of float32, shape (N, sum of the columns)
+        N at least 1.
+    """
+
+    def __init__(self, tables, host, names, points):
+        self.ctx = gl.context()
+        self._owned, self._n = [tables], len(points)
+        # Without a bound framebuffer transform feedback on a surfaceless context returns zeros, without an error.
+        self._target = self._own(self.ctx.simple_framebuffer((1, 1)))
+        self._target.use()
+        self._program = self._own(tables.program(self.ctx, host, varyings=("value",)))
+        self._textures = tables.textures
+        content, start = [], 0
+        for name, width in names.items():
+            if name in self._program:
+                columns = np.ascontiguousarray(points[:, start : start + width])
+                content.append((self._own(self.ctx.buffer(columns.tobytes())), f"{width}f", name))
+            start += width
+        self._vertices = self._own(self.ctx.vertex_array(self._program, content))
+        self._result = self._own(self.ctx.buffer(reserve=12 * self._n))
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        while self._owned:
+            self._owned.pop().release()
+
+    def _own(self, thing):
+        self._owned.append(thing)
+        return thing
+
+    def run(self):
+        """Evaluate all points and wait."""
+        self._target.use()
+        gl.bind(self._program, self._textures)
+        self._vertices.transform(self._result, mode=self.ctx.POINTS, vertices=self._n)
+        self.ctx.finish()
+
+    def values(self):
+        """What the last run found, float32 (N, 3)."""
+        return np.frombuffer(self._result.read(), np.float32).reshape(-1, 3).copy()
+
+
+def probe_points(rep, points, *, filter_type=None):
+    """A :class:`Probe` of ``rep`` at rows of :func:`broadcast_points`; the caller runs and releases it."""
+    names = {"uv": 2, "w_light": 3, "w_view": 3, "lod": 1}
+    tables = gl.ShaderRepresentation.upload(gl.context(), rep, filter_type=filter_type)
+    return Probe(tables, "hosts/probe.vert", names, points)
+
+
 def _transformed(tables, host, names, points):
     """``value`` of a vertex host for rows of attributes; the tables are released."""
-    ctx = gl.context()
     if not len(points):
         tables.release()
         return np.zeros((0, 3), np.float32)
-    # Without a bound framebuffer transform feedback on a surfaceless context returns zeros, without an error.
-    target = ctx.simple_framebuffer((1, 1))
-    target.use()
-    program = tables.program(ctx, host, varyings=("value",))
-    gl.bind(program, tables.textures)
-    content, buffers, start = [], [], 0
-    for name, width in names.items():
-        if name in program:
-            columns = np.ascontiguousarray(points[:, start : start + width])
-            buffers.append(ctx.buffer(columns.tobytes()))
-            content.append((buffers[-1], f"{width}f", name))
-        start += width
-    vertices = ctx.vertex_array(program, content)
-    result = ctx.buffer(reserve=12 * len(points))
-    vertices.transform(result, mode=ctx.POINTS, vertices=len(points))
-    values = np.frombuffer(result.read(), np.float32).reshape(-1, 3).copy()
-    for thing in (*buffers, vertices, result, program, target, tables):
-        thing.release()
-    return values
+    with Probe(tables, host, names, points) as made:
+        made.run()
+        return made.values()
 
 
 def broadcast_points(uv, w_light, w_view, lod=0.0):

@@ -1,0 +1,172 @@
+"""Runs a plan: everything that it measures, of every entry, on every material; raw results as JSON lines.
+
+A folder holds ``results.jsonl``, a line for the run and then one a record; ``queries/MATERIAL.npz``, the entries of the
+BTF that every representation was asked for; ``values/NUMBER.npy``, the answers. Metrics are computed from these by
+:mod:`btfref.bench.metrics`, so that a new metric needs no new run.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import uuid
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from btfref.bench import measures
+from btfref.bench.data import materials
+from btfref.bench.subjects import build
+from btfref.bench.timing import machine
+
+RESULTS = "results.jsonl"
+
+
+def run(plan, out, *, btf=None, progress=None):
+    """Measure what a plan says.
+
+    Parameters
+    ----------
+    plan : btfref.bench.plan.Plan
+    out : path-like
+        Folder; a second run is added to what it holds.
+    btf : SampledBTF, optional
+        Instead of the plan's mesostructures.
+    progress : callable, optional
+        ``progress(done, total, label)``.
+
+    Returns
+    -------
+    str
+        Number of the run.
+    """
+    from btfref.platform import prepare_llvm
+
+    writer = _Writer(Path(out), plan)
+    if {"eval", "render", "sampling"} & set(plan.measures):
+        prepare_llvm()
+        import mitsuba as mi
+
+        if mi.variant() is None or not mi.variant().endswith("_ad_rgb"):
+            mi.set_variant("cuda_ad_rgb" if _has_cuda() else "llvm_ad_rgb")
+        import mitsuba_plugins
+
+        mitsuba_plugins.register()
+        writer.run["variant"] = mi.variant()
+    writer.header()
+    data = dict(plan.data)
+    names = data.pop("mesostructures")
+    directions = data.pop("directions")
+    settings = {**data, "views": directions, "lights": directions, "seed": plan.seed}
+    for name, sampled in materials(btf, names, progress=progress, **settings):
+        _material(plan, name, sampled, writer, progress)
+    return writer.run["id"]
+
+
+class _Writer:
+    """Adds records to a folder as they come: what was measured survives an interruption."""
+
+    def __init__(self, folder, plan):
+        self.folder = folder
+        for sub in ("queries", "values"):
+            (folder / sub).mkdir(parents=True, exist_ok=True)
+        self.run = {
+            "record": "run",
+            "id": uuid.uuid4().hex[:12],
+            "started": datetime.now(UTC).isoformat(timespec="seconds"),
+            "plan": plan.to_dict(),
+            "machine": machine(),
+        }
+
+    def header(self):
+        self._line(self.run)
+
+    def add(self, kind, material, entry, record):
+        described = {"entry": entry.name, "method": entry.method, "peer": entry.peer, "build": entry.build}
+        if entry.bytes_of:
+            described["bytes_of"] = entry.bytes_of
+        self._line({"record": kind, "run": self.run["id"], "material": material, **described, **record})
+
+    def plain(self, kind, material, record):
+        self._line({"record": kind, "run": self.run["id"], "material": material, "plain": True, **record})
+
+    def queries(self, material, arrays):
+        name = f"queries/{self.run['id']}-{material}.npz"
+        np.savez(self.folder / name, **arrays)
+        return name
+
+    def values(self, array):
+        name = f"values/{uuid.uuid4().hex[:12]}.npy"
+        np.save(self.folder / name, np.asarray(array, np.float32))
+        return name
+
+    def _line(self, record):
+        with (self.folder / RESULTS).open("a") as stream:
+            stream.write(json.dumps(record) + "\n")
+
+
+def _material(plan, name, btf, writer, progress):
+    rng = np.random.default_rng(plan.seed)
+    queries = measures.sample_queries(btf, plan.settings["error_samples"], rng)
+    asked = writer.queries(name, queries)
+    total = len(plan.entries) * (plan.rounds["build"] + len(plan.measures) - 1)
+    steps = iter(range(total + 1))
+
+    def report(label):
+        if progress:
+            progress(next(steps, total), total, f"{name}: {label}")
+
+    def maker(entry):
+        def make(built):
+            payload = built[entry.bytes_of].payload if entry.bytes_of else None
+            return build(entry, btf, seed=plan.seed, payload=payload)
+
+        return make
+
+    makes = {entry.name: maker(entry) for entry in plan.entries}
+    built, records = measures.timed_builds(
+        makes, plan.rounds["build"], lambda entry: report(f"build {entry}")
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        paths = {}
+        for entry in plan.entries:
+            paths[entry.name] = measures.saved(built[entry.name], entry, folder)
+            path = paths[entry.name]
+            more = {"file_bytes": path.stat().st_size if path else None}
+            writer.add("build", name, entry, {**records[entry.name], **more})
+        own = [(entry, paths[entry.name]) for entry in plan.entries if paths[entry.name]]
+        if "error" in plan.measures:
+            for entry in plan.entries:
+                report(f"error of {entry.name}")
+                found = built[entry.name].evaluate(queries["uv"], queries["w_light"], queries["w_view"])
+                writer.add("error", name, entry, {"queries": asked, "values": writer.values(found)})
+        if "eval" in plan.measures:
+            for entry in plan.entries:
+                report(f"evaluations of {entry.name}")
+                path = paths[entry.name]
+                for record in measures.measure_eval(built[entry.name], path, plan, entry, rng):
+                    writer.add("eval", name, entry, record)
+        built.clear()
+        if "render" in plan.measures:
+            report("pictures")
+            for entry, record in measures.measure_render(own, btf, plan):
+                if entry is None:
+                    writer.plain("render", name, record)
+                else:
+                    writer.add("render", name, entry, record)
+        for kind, measure in (
+            ("sampling", measures.measure_sampling),
+            ("realtime", measures.measure_realtime),
+        ):
+            if kind in plan.measures:
+                for entry, path in own:
+                    report(f"{kind} of {entry.name}")
+                    for record in measure(entry, path, plan):
+                        writer.add(kind, name, entry, record)
+
+
+def _has_cuda():
+    import drjit as dr
+
+    return dr.has_backend(dr.JitBackend.CUDA)

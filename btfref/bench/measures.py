@@ -1,0 +1,272 @@
+"""What a plan measures of what it built: each measure yields raw records, from which all metrics are computed later.
+
+A record is a dictionary for one line of JSON. Times are in seconds: ``cold_s`` the first call, kernels compiled and
+caches filled, ``warm_s`` one item a round. Rounds of one record and of others of the same measure and material took
+turns, so that item i of each makes a pair.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from btfref.bench import scenes
+from btfref.bench.evaluators import EVALUATORS, evaluation, random_points
+from btfref.bench.timing import interleaved
+
+
+def timed_builds(makes, rounds, report=lambda name: None):
+    """Build every entry in each round, in turn.
+
+    Parameters
+    ----------
+    makes : dict of str to callable
+        ``built -> Built``: gets what is built already, by name.
+    rounds : int
+        The first holds the cold times.
+    report : callable, optional
+        Called with a name before it is built.
+
+    Returns
+    -------
+    built : dict of str to Built
+    records : dict of str to dict
+        ``peak_bytes``: how far the process grew beyond what it held before; None where the system does not tell.
+    """
+    built, records = {}, {}
+    for i in range(rounds):
+        for name, make in makes.items():
+            report(name)
+            built.pop(name, None)
+            before = _reset_peak()
+            start = time.perf_counter()
+            built[name] = make(built)
+            seconds = time.perf_counter() - start
+            peak = _peak()
+            if i:
+                records[name]["warm_s"].append(seconds)
+                continue
+            records[name] = {
+                "cold_s": seconds,
+                "warm_s": [],
+                "payload": built[name].payload,
+                "peak_bytes": None if before is None or peak is None else max(0, peak - before),
+            }
+    return built, records
+
+
+def sample_queries(btf, n, rng):
+    """Random measured entries of a BTF, to be asked of every representation.
+
+    Parameters
+    ----------
+    btf : SampledBTF
+    n : int
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    dict of str to ndarray
+        ``uv``, ``w_light``, ``w_view`` (texel centres and measured directions, float64); ``expected`` (n, 3).
+    """
+    shape = btf.values.shape
+    view, light, row, column = (rng.integers(0, k, n) for k in shape[:4])
+    return {
+        "uv": (np.stack([column / shape[3], row / shape[2]], 1) + 0.5 / np.array([shape[3], shape[2]])),
+        "w_light": btf.lights.vectors[light],
+        "w_view": btf.views.vectors[view],
+        "expected": btf.values[view, light, row, column].astype(np.float32),
+    }
+
+
+def measure_eval(built, path, plan, entry, rng):
+    """Evaluations by NumPy, Dr.Jit and GLSL, each on its own number of points.
+
+    Yields
+    ------
+    dict
+        ``largest_difference`` from NumPy's values at the first points, over the largest of these.
+    """
+    known = EVALUATORS if built.representation is not None else EVALUATORS[:1]
+    points = {kind: random_points(plan.settings["points"][kind], rng) for kind in known}
+    for query in entry.query:
+        reference = None
+        for kind in known:
+            with evaluation(kind, built, path, points[kind], query) as (run, values):
+                start = time.perf_counter()
+                run()
+                cold = time.perf_counter() - start
+                times = interleaved({kind: run}, plan.rounds["eval"])[kind]
+                found = values()
+            if reference is None:
+                reference = found
+                some = points[kind]
+            else:
+                # The same points again, by this evaluator.
+                with evaluation(kind, built, path, some, query) as (run, values):
+                    run()
+                    found = values()
+            largest = float(np.abs(reference).max())
+            difference = float(np.abs(found - reference).max()) / largest if largest else 0.0
+            yield {
+                "query": query,
+                "evaluator": kind,
+                "points": len(points[kind][0]),
+                "cold_s": cold,
+                "warm_s": times,
+                "largest_difference": difference,
+            }
+
+
+def measure_render(subjects, btf, plan):
+    """Pictures of equal samples: every build and every plain material, in turn.
+
+    Parameters
+    ----------
+    subjects : list of (Entry, path)
+    btf : SampledBTF
+    plan : Plan
+
+    Yields
+    ------
+    entry or None, dict
+        None for a plain material; ``variance`` is the mean over the pixels of the squared noise of one picture, by
+        half the squared difference of two, ``mean`` that of the radiance.
+    """
+    import mitsuba as mi
+
+    materials = {name: (None, {}, bsdf) for name, bsdf in scenes.plain_materials(btf).items()}
+    for entry, path in subjects:
+        for query in entry.query:
+            name = " ".join([entry.name, *map(str, query.values())])
+            materials[name] = (entry, query, scenes.btf_material(path, query))
+    for scene in plan.settings["scenes"]:
+        tasks, pictures, cold = {}, {}, {}
+        for name, (_, _, bsdf) in materials.items():
+            loaded = mi.load_dict(scenes.scene(scene, bsdf, size=plan.settings["render_size"]))
+            render = scenes.render_task(loaded, plan.settings["render_spp"])
+            start = time.perf_counter()
+            first = np.array(render())
+            cold[name] = time.perf_counter() - start
+            pictures[name] = [first]
+            tasks[name] = _keeping(render, pictures[name])
+        times = interleaved(tasks, plan.rounds["render"])
+        for name, (entry, query, _) in materials.items():
+            one, other = (np.asarray(p) for p in pictures[name][:2])
+            yield (
+                entry,
+                {
+                    "name": name,
+                    "query": query,
+                    "scene": scene,
+                    "spp": plan.settings["render_spp"],
+                    "cold_s": cold[name],
+                    "warm_s": times[name],
+                    "variance": float(((one - other) ** 2).mean() / 2),
+                    "mean": float(one.mean()),
+                },
+            )
+
+
+def measure_sampling(entry, path, plan):
+    """Light directions by the data against cosine-distributed ones: variance and time of the same picture.
+
+    A sphere in a constant sky, light from the material's samples alone.
+
+    Yields
+    ------
+    dict
+        For each way, ``variance`` (mean over pixels of the noise's squares, from ``repeats`` independent pictures),
+        ``warm_s`` in rounds that took turns.
+    """
+    import mitsuba as mi
+
+    integrator = {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1}
+    settings = plan.settings
+    for query in entry.query:
+        tasks, pictures = {}, {}
+        for way in ("data", "cosine"):
+            bsdf = scenes.btf_material(path, query, sampling=way)
+            made = scenes.scene("sphere, sky", bsdf, size=settings["sampling_size"], integrator=integrator)
+            render = scenes.render_task(mi.load_dict(made), settings["sampling_spp"])
+            pictures[way] = [np.array(render()) for _ in range(settings["sampling_repeats"])]
+            tasks[way] = render
+        times = interleaved(tasks, plan.rounds["sampling"])
+        for way, found in pictures.items():
+            stack = np.stack(found)
+            yield {
+                "query": query,
+                "way": way,
+                "repeats": len(found),
+                "warm_s": times[way],
+                "variance": float(stack.var(0, ddof=1).mean()),
+                "mean": float(stack.mean()),
+            }
+
+
+def measure_realtime(entry, path, plan):
+    """Frame times of the shipped cloth in GLSL: timer or wall clock, whichever is longer.
+
+    Yields
+    ------
+    dict
+    """
+    from btfref.render.realtime import Renderer
+    from btfref.render.scene import read_scene
+    from btfref.scenes import scene_file
+
+    for query in entry.query:
+        for size in plan.settings["frames"]:
+            parameters = {"btf": str(path), "lights": "directional3"}
+            if "filter_type" in query:
+                parameters["filter"] = query["filter_type"]
+            scene = read_scene(scene_file("cloth"), parameters, size=tuple(size))
+            with Renderer(scene) as renderer:
+                cold = 1e-3 * renderer.draw()
+                times = [1e-3 * renderer.draw() for _ in range(plan.rounds["realtime"] + 1)][1:]
+            yield {"query": query, "size": list(size), "cold_s": cold, "warm_s": times}
+
+
+def saved(built, entry, folder):
+    """File of a build, or None for a peer."""
+    if built.representation is None:
+        return None
+    from btfref.representations import save
+
+    handle = tempfile.NamedTemporaryFile(dir=folder, suffix=f".{entry.method}.exr", delete=False)
+    handle.close()
+    save(built.representation, handle.name)
+    return Path(handle.name)
+
+
+def _keeping(render, pictures):
+    def task():
+        image = render()
+        if len(pictures) < 2:
+            pictures.append(np.array(image))
+
+    return task
+
+
+def _reset_peak():
+    """Start counting the peak of the process anew; what it holds now in bytes, or None."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+        return _status("VmRSS")
+    except OSError:
+        return None
+
+
+def _peak():
+    return _status("VmHWM")
+
+
+def _status(field):
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return None
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(field + ":")), None)

@@ -1,0 +1,201 @@
+"""Metrics of raw records: errors with intervals, medians with spread, ratios of pairs, efficiencies.
+
+Everything here reads what :mod:`btfref.bench.matrix` wrote and measures nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+from pathlib import Path
+
+import numpy as np
+
+from btfref.bench.matrix import RESULTS
+from btfref.bench.scenes import BASELINE
+from btfref.errors import InputError
+
+#: Half-width of a 99 % interval in standard errors.
+Z99 = 2.5758
+
+
+def read_records(folder):
+    """The records of a folder.
+
+    Parameters
+    ----------
+    folder : path-like
+        As written by :func:`btfref.bench.matrix.run`.
+
+    Returns
+    -------
+    list of dict
+
+    Raises
+    ------
+    InputError
+        For a folder without results, or a line that is no record.
+    """
+    path = Path(folder) / RESULTS
+    try:
+        lines = path.read_text().splitlines()
+    except OSError as error:
+        raise InputError("no results of a benchmark", file=path, got=error.strerror) from None
+    records = []
+    for i, line in enumerate(lines):
+        try:
+            record = json.loads(line)
+            record["record"]
+        except (json.JSONDecodeError, KeyError, TypeError):
+            raise InputError("not a record", file=path, field=f"line {i + 1}", got=line[:60]) from None
+        records.append(record)
+    return records
+
+
+def latest(records):
+    """The records of the last run of each plan."""
+    runs = {r["plan"]["name"]: r["id"] for r in records if r["record"] == "run"}
+    return [r for r in records if r.get("run", r.get("id")) in runs.values()]
+
+
+def spread(times):
+    """Median and extremes of times in seconds, or None for none."""
+    if not times:
+        return None
+    return {"median": statistics.median(times), "min": min(times), "max": max(times), "n": len(times)}
+
+
+def time_of(record):
+    """Spread of the warm times; of the cold one where no other was taken."""
+    return spread(record["warm_s"]) or spread([record["cold_s"]])
+
+
+def paired_ratio(record, baseline):
+    """Median and extremes of the ratios of the rounds of two records that took turns."""
+    pairs = list(zip(record["warm_s"], baseline["warm_s"], strict=False))
+    if not pairs:
+        pairs = [(record["cold_s"], baseline["cold_s"])]
+    return spread([a / b for a, b in pairs])
+
+
+def errors(folder, record):
+    """Errors of the answers to random entries of a BTF.
+
+    Parameters
+    ----------
+    folder : path-like
+    record : dict
+        Of kind "error".
+
+    Returns
+    -------
+    dict
+        ``rmse`` over the root mean square of the data, ``relmse``, ``delta_e00`` (root mean square, entries times π
+        as colours), ``bias`` over the mean; ``rmse`` and ``delta_e00`` with the ends of their 99 % intervals
+        (normal, over the random choice of entries, by the delta method).
+    """
+    from btfref.compare import metrics
+    from btfref.compare.colour import ciede2000, lab
+
+    expected = np.load(Path(folder) / record["queries"])["expected"].astype(float)
+    found = np.load(Path(folder) / record["values"]).astype(float)
+    squared = ((found - expected) ** 2).sum(1)
+    energy = (expected**2).sum(1)
+    shown = [lab(np.clip(np.pi * values, 0, 1)) for values in (found, expected)]
+    delta = ciede2000(*shown) ** 2
+    low, rmse, high = _root_ratio(squared, energy)
+    d_low, d, d_high = _root_ratio(delta, np.ones_like(delta))
+    return {
+        "rmse": rmse,
+        "rmse_low": low,
+        "rmse_high": high,
+        "relmse": metrics.relmse(found, expected),
+        "delta_e00": d,
+        "delta_e00_low": d_low,
+        "delta_e00_high": d_high,
+        "bias": float((found - expected).mean() / expected.mean()) if expected.mean() else 0.0,
+        "n": len(expected),
+    }
+
+
+def _root_ratio(top, bottom):
+    """√(mean top / mean bottom) and the ends of its 99 % interval, from pairs of samples."""
+    if not bottom.any():
+        return 0.0, 0.0, 0.0
+    ratio = top.mean() / bottom.mean()
+    error = (top - ratio * bottom).std(ddof=1) / np.sqrt(len(top)) / bottom.mean()
+    ends = ratio - Z99 * error, ratio, ratio + Z99 * error
+    return tuple(float(np.sqrt(max(0.0, x))) for x in ends)
+
+
+def rows(folder, records=None):
+    """Metrics of all records, grouped by what they are of.
+
+    Parameters
+    ----------
+    folder : path-like
+    records : list of dict, optional
+        Default: the last run of each plan in the folder.
+
+    Returns
+    -------
+    list of dict
+        ``kind``, ``material``, ``entry``, ``query`` (text), and the metrics of the kind.
+    """
+    records = latest(read_records(folder)) if records is None else records
+    plain = {
+        (r["run"], r["material"], r["scene"]): r
+        for r in records
+        if r["record"] == "render" and r.get("name") == BASELINE
+    }
+    cosine = {
+        (r["run"], r["material"], r["entry"], str(r["query"])): r
+        for r in records
+        if r["record"] == "sampling" and r["way"] == "cosine"
+    }
+    baselines = {r["id"]: r["plan"]["baseline"] for r in records if r["record"] == "run"}
+    builds = {}
+    for r in records:
+        if r["record"] == "build":
+            key = r["run"], r["material"]
+            if r["entry"] == baselines[r["run"]] or key not in builds:
+                builds[key] = r
+    result = []
+    for r in records:
+        kind = r["record"]
+        if kind == "run":
+            continue
+        row = {"kind": kind, "material": r["material"], "entry": r.get("entry") or r["name"]}
+        row["query"] = " ".join(map(str, r.get("query", {}).values()))
+        if kind == "build":
+            base = builds[r["run"], r["material"]]
+            row |= {"time": time_of(r), "cold_s": r["cold_s"], "ratio": paired_ratio(r, base)}
+            row |= {key: r[key] for key in ("payload", "file_bytes", "peak_bytes")}
+        elif kind == "error":
+            row |= errors(folder, r)
+        elif kind == "eval":
+            row |= {"evaluator": r["evaluator"], "cold_s": r["cold_s"], "time": time_of(r)}
+            row["per_second"] = r["points"] / row["time"]["median"]
+            row["largest_difference"] = r["largest_difference"]
+        elif kind == "render":
+            base = plain[r["run"], r["material"], r["scene"]]
+            row |= {"scene": r["scene"], "cold_s": r["cold_s"], "time": time_of(r)}
+            row["ratio"] = paired_ratio(r, base)
+            # The noise of a picture that is given one second: variance falls with samples, samples grow with time.
+            row["noise_at_1s"] = float(np.sqrt(r["variance"] * row["time"]["median"]) / r["mean"])
+        elif kind == "sampling":
+            if r["way"] != "data":
+                continue
+            other = cosine[r["run"], r["material"], r["entry"], str(r["query"])]
+            row["variance_ratio"] = r["variance"] / other["variance"] if other["variance"] else 1.0
+            row["time_ratio"] = paired_ratio(r, other)
+            # 1 / (variance · time), over that of cosine sampling.
+            row["efficiency"] = 1 / max(row["variance_ratio"] * row["time_ratio"]["median"], 1e-30)
+        elif kind == "realtime":
+            row |= {
+                "size": "x".join(map(str, r["size"])),
+                "cold_s": r["cold_s"],
+                "time": time_of(r),
+            }
+        result.append(row)
+    return result
