@@ -42,8 +42,15 @@ def luminance(rgb):
     return np.asarray(rgb) @ LUMINANCE
 
 
+#: Least z of a direction above the horizon: the smallest normal float32, since some ports flush what is smaller to 0.
+LEAST_Z = 2.0**-126
+
+#: Squared lengths between which a vector counts as a direction; rounding moves a unit vector by some 1e-7.
+SQUARED_LENGTHS = (0.25, 4.0)
+
+
 def valid_directions(w):
-    """Where a direction is finite and above the horizon.
+    """Where a vector is a direction above the horizon: the one rule of all evaluators.
 
     Parameters
     ----------
@@ -52,11 +59,38 @@ def valid_directions(w):
     Returns
     -------
     ndarray of bool, shape (...)
-        NaN, infinite and clearly unnormalised vectors (length > 2) count as invalid: their value is 0.
+        NaN, infinite and clearly unnormalised vectors (length outside of ½ … 2) count as invalid: their value is
+        exactly 0. :func:`malformed` counts them.
     """
     w = np.asarray(w, float)
+    low, high = SQUARED_LENGTHS
     with np.errstate(invalid="ignore", over="ignore"):
-        return (w[..., 2] > 0) & (np.einsum("...i,...i->...", w, w) < 4)
+        square = np.einsum("...i,...i->...", w, w)
+        return (w[..., 2] >= LEAST_Z) & (square > low) & (square < high)
+
+
+def malformed(uv, w_light, w_view):
+    """How many lookups ask for what is none: apart from directions below the horizon, which are ordinary.
+
+    Parameters
+    ----------
+    uv : array_like, shape (..., 2)
+    w_light, w_view : array_like, shape (..., 3)
+
+    Returns
+    -------
+    dict of str to int
+        ``directions``: lookups with a vector that is not finite or clearly not of unit length; their value is 0.
+        ``coordinates``: lookups with ``uv`` that is not finite; it counts as 0.
+    """
+    low, high = SQUARED_LENGTHS
+    unit = True
+    with np.errstate(invalid="ignore", over="ignore"):
+        for w in (w_light, w_view):
+            square = np.einsum("...i,...i->...", np.asarray(w, float), np.asarray(w, float))
+            unit = unit & (square > low) & (square < high)
+    finite = np.isfinite(np.asarray(uv, float)).all(-1)
+    return {"directions": int(np.count_nonzero(~unit)), "coordinates": int(np.count_nonzero(~finite))}
 
 
 def texel_stencil(uv, shape, filter_type):

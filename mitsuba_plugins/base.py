@@ -147,7 +147,12 @@ def make_bsdf():
             return LevelOfDetail(mode, bias, unit, angle, camera, self.affine, self.maps.shape)
 
         def _uv(self, si):
-            return mi.Point2f(*(dr.fma(si.uv.x, a, dr.fma(si.uv.y, b, c)) for a, b, c in self.affine))
+            # Terms with factor 0 are left out: a coordinate that is not finite must not spoil the other one.
+            def row(a, b, c):
+                value = mi.Float(c) if b == 0 else dr.fma(si.uv.y, b, c)
+                return value if a == 0 else dr.fma(si.uv.x, a, value)
+
+            return mi.Point2f(*(row(*coefficients) for coefficients in self.affine))
 
         def _local(self, w):
             """A direction in the texture's frame, and whether it is valid; the pole stands in for invalid ones.

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from btfref.conventions import LEAST_Z, SQUARED_LENGTHS
 from btfref.numerics.interpolation import MISSING
 
 #: Half tables are multiplied by this power of two when they are packed: the smallest subnormal half becomes normal.
@@ -29,7 +30,9 @@ UNROLLED_WIDTH = 8
 
 def valid_directions(w):
     """As :func:`btfref.conventions.valid_directions`."""
-    return (w.z > 0) & (dr.squared_norm(w) < 4)
+    low, high = SQUARED_LENGTHS
+    square = dr.squared_norm(w)
+    return (w.z >= LEAST_Z) & (square > low) & (square < high)
 
 
 #: π/4 as a sum of two float32: differences to a tabulated angle keep float accuracy.
@@ -71,7 +74,8 @@ def texel_position(uv, shape, shift):
     low = dr.floor(dr.fma(uv, size, -shift))
     # One rounding, of a number in [0, 1): the integer part cancels inside the fused operation.
     f = dr.clip(dr.fma(uv, size, -shift - low), 0, 1)
-    return low - size * dr.floor(low / size), f
+    # Half a texel keeps exact multiples of the size away from where a rounded quotient would fall below its floor.
+    return low - size * dr.floor((low + 0.5) / size), f
 
 
 def texel_stencil(uv, shape, filter_type):

@@ -16,4 +16,5 @@ COMMANDS = (
     "realtime",
     "compare",
     "bench",
+    "stress",
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from btfref.errors import InputError
 from btfref.numerics.threads import one_blas_thread
 
 
@@ -17,6 +18,11 @@ def texel_matrix(values):
     Returns
     -------
     ndarray of float32, shape (row * column, view * light * 3)
+
+    Raises
+    ------
+    InputError
+        For values that are not finite.
     """
     views, lights, rows, columns, channels = values.shape
     # A texel's colour moves as one item: three times fewer, and larger, strided copies.
@@ -27,6 +33,8 @@ def texel_matrix(values):
     for start in range(0, rows * columns, 256):
         block = np.ascontiguousarray(table[:, start : start + 256].T)
         result[start : start + 256] = block.view(values.dtype).reshape(len(block), -1)
+        if not np.isfinite(result[start : start + 256]).all():
+            raise InputError("the BTF holds a value that is not finite", field="values")
     return result
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from btfref import conventions
+from btfref.errors import InputError
 from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import StoredMaps, base_meta, direction_arrays, evaluate_tabulated
 
@@ -52,7 +53,15 @@ def fit(btf, *, seed=0, progress=None, filter_type="bilinear"):
         Unused: the copy takes no noticeable time.
     filter_type : {"bilinear", "nearest"}
         Texel filter that :meth:`Representation.evaluate` and the ports use.
+
+    Raises
+    ------
+    InputError
+        For values that are not finite.
     """
+    for view in btf.values:
+        if not np.isfinite(view).all():
+            raise InputError("the BTF holds a value that is not finite", file=btf.path)
     values = np.ascontiguousarray(np.transpose(btf.values, (2, 3, 0, 1, 4)))
     meta = base_meta("raw", btf, {}, filter_type=filter_type)
     return Representation({"values": values, **direction_arrays(btf.views, btf.lights)}, meta)

@@ -23,9 +23,15 @@ uniform sampler2DArray light_triangles;
 uniform sampler2DArray light_cells;
 #endif
 
-// Above the horizon and neither NaN nor far from unit length (comparisons with NaN are false).
+// Above the horizon and neither NaN nor far from unit length (comparisons with NaN are false). The least z is the
+// smallest normal float: where subnormal ones are flushed to 0 the answer is the same.
+bool direction_valid(vec3 w) {
+    float square = dot(w, w);
+    return w.z >= 1.17549435e-38 && square > 0.25 && square < 4.0;
+}
+
 bool directions_valid(vec3 w_light, vec3 w_view) {
-    return w_light.z > 0.0 && w_view.z > 0.0 && dot(w_light, w_light) < 4.0 && dot(w_view, w_view) < 4.0;
+    return direction_valid(w_light) && direction_valid(w_view);
 }
 
 Stencil view_stencil(vec3 w) {

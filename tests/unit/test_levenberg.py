@@ -4,13 +4,13 @@ import types
 
 import numpy as np
 import pytest
-from oracle import oracle_values
 
 from btfref.compare.tolerances import tolerance
 from btfref.numerics.directions import directions
 from btfref.numerics.levenberg import backend, fit_batch
 from btfref.representations.lafortune import lafortune_model
 from btfref.representations.rf_lobes import fit_lobes, lobe_model
+from btfref.stress.data import bumpy_values
 
 
 @pytest.fixture
@@ -129,7 +129,7 @@ def test_lobes_are_no_worse_than_scipy_s(module):
     from btfref.representations.lobe_start import exponent_limit, lobe_starts
 
     lights = directions("ubo81")
-    data = oracle_values((6, 5), lights, lights)[20].mean(-1).reshape(81, -1).T.astype(np.float32)
+    data = bumpy_values((6, 5), lights, lights)[20].mean(-1).reshape(81, -1).T.astype(np.float32)
     result = fit_lobes(data, lights, 2)
     starts = lobe_starts(data, lights.vectors, 2)
     assert result.converged.all()

@@ -1,0 +1,1 @@
+"""Numerical stability: every method and every evaluator under hard lookups and hard data."""

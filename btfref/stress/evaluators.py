@@ -1,0 +1,85 @@
+"""The evaluators of a representation under one interface: lookups in, values of B out."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from btfref.errors import InputError
+
+#: Ports by name. The definition, in float64, is what they are measured against.
+PORTS = ("drjit", "drjit without FastMath", "glsl")
+
+
+def definition(representation, lookups):
+    """Values in float64; a representation with levels gets each lookup's own, shape (n, 3)."""
+    return representation.evaluate(*lookups.points, lod=lookups.lod)
+
+
+def port(name, representation, path):
+    """An evaluator.
+
+    Parameters
+    ----------
+    name : str
+        One of ``PORTS``.
+    representation : Representation
+    path : path-like
+        Its file.
+
+    Returns
+    -------
+    callable
+        ``Lookups -> ndarray of float32, shape (n, 3)``.
+
+    Raises
+    ------
+    InputError
+        Unknown name.
+    """
+    if name == "glsl":
+        return _glsl(representation)
+    if name in ("drjit", "drjit without FastMath"):
+        return _drjit(path, fast=name == "drjit")
+    raise InputError("unknown evaluator", field="--evaluator", got=repr(name), expected=", ".join(PORTS))
+
+
+def _glsl(representation):
+    from btfref.render.probe import probe
+
+    return lambda lookups: probe(representation, *lookups.points, lookups.lod)
+
+
+def _drjit(path, *, fast):
+    from btfref.platform import prepare_llvm
+
+    prepare_llvm()
+    import drjit as dr
+    import mitsuba as mi
+
+    if mi.variant() is None or mi.variant().startswith("scalar"):
+        mi.set_variant("llvm_ad_rgb")
+    import mitsuba_plugins
+
+    mitsuba_plugins.register()
+    # The level is fixed to 0 here; other levels go to the plugin's evaluator directly.
+    bsdf = mi.load_dict({"type": "btf", "filename": str(path), "lod": "none"})
+    levelled = hasattr(bsdf.evaluator, "max_lod")
+
+    def evaluate(lookups):
+        from mitsuba_plugins.lookup import valid_directions
+
+        uv, light, view = (np.ascontiguousarray(a.T) for a in lookups.points)
+        with dr.scoped_set_flag(dr.JitFlag.FastMath, fast):
+            light = mi.Vector3f(light)
+            if not levelled:
+                si = dr.zeros(mi.SurfaceInteraction3f, len(lookups))
+                si.uv, si.wi = mi.Point2f(uv), mi.Vector3f(view)
+                return np.array(bsdf.eval(mi.BSDFContext(), si, light)).T
+            view = mi.Vector3f(view)
+            valid = valid_directions(light) & valid_directions(view)
+            up = mi.Vector3f(0, 0, 1)
+            light, view = dr.select(valid, light, up), dr.select(valid, view, up)
+            value = bsdf.evaluator.evaluate(mi.Point2f(uv), light, view, valid, lod=mi.Float(lookups.lod))
+            return np.array(dr.select(valid, value, 0)).T
+
+    return evaluate

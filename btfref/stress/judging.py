@@ -1,0 +1,167 @@
+"""What stress checks find, and how the value of a port is judged against the definition."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from btfref.compare.tolerances import gate_table, tolerance
+
+#: Random points of the box of rounded arguments among which a differing value is looked for.
+NEIGHBOURS = 256
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One check of one evaluator of one method on some data.
+
+    Attributes
+    ----------
+    check, method, evaluator, data : str
+    cases : int
+        Lookups, or comparisons, that were judged.
+    worst : float
+        Largest error, in the unit of ``bound``.
+    bound : float
+        What it must not exceed.
+    failures : int
+        Cases beyond it.
+    explained : int
+        Cases beyond it whose value the definition takes within the rounding of the arguments.
+    where : str
+        What the worst case was.
+    reproducer : str
+        A command that shows the first failure, or the worst case; "" where the check is its own.
+    detail : dict
+        Further numbers: distribution of the error in units in the last place, relative error.
+    """
+
+    check: str
+    method: str
+    evaluator: str
+    data: str
+    cases: int
+    worst: float
+    bound: float
+    failures: int
+    explained: int = 0
+    where: str = ""
+    reproducer: str = ""
+    detail: dict | None = None
+
+    @property
+    def passed(self):
+        """Whether no case failed."""
+        return not self.failures
+
+    def to_dict(self):
+        """JSON-able."""
+        return asdict(self) | {"passed": self.passed}
+
+
+def limit_finding(check, method, data, worst, key, *, evaluator="definition", cases=1, where="", detail=None):
+    """A finding of one number with an upper limit in ``tolerances.toml``; NaN fails.
+
+    A limit of the method's own stands beside the common one, with its key at the end of the name.
+    """
+    gate, _, name = key.rpartition(".")
+    own = f"{name}_{method}"
+    bound = tolerance(f"{gate}.{own}" if own in gate_table(gate) else key)
+    return Finding(
+        check,
+        method,
+        evaluator,
+        data,
+        cases,
+        float(worst),
+        bound,
+        int(not worst <= bound),
+        0,
+        where,
+        "",
+        detail,
+    )
+
+
+def judge_values(value, reference, representation, lookups, gate):
+    """Compare a port's values with the definition's.
+
+    A value passes when it is finite and within the gate's relative ``max`` of the definition, or of a value that the
+    definition takes at arguments moved by their rounding; and where the definition is exactly 0 because a direction is
+    none, exactly 0.
+
+    Parameters
+    ----------
+    value, reference : ndarray, shape (n, 3)
+    representation : Representation
+    lookups : Lookups
+    gate : str
+        Table of ``tolerances.toml`` with ``floor``, ``max`` and ``argument_ulps``.
+
+    Returns
+    -------
+    failed, explained : ndarray of bool, shape (n,)
+    error : ndarray, shape (n,)
+        Relative error of the worst channel, infinite where the value is not finite.
+    ulps : ndarray, shape (n,)
+        The same in units in the last place of a float32 of the reference's magnitude.
+    """
+    value = np.asarray(value, float)
+    finite = np.isfinite(value).all(-1)
+    safe = np.where(finite[:, None], value, 0)
+    largest = np.abs(reference).max(initial=0)
+    # A black BTF has no scale: any value but 0 is then an error of more than any bound.
+    scale = np.maximum(np.abs(reference), max(tolerance(f"{gate}.floor") * largest, np.finfo(float).tiny))
+    difference = np.abs(safe - reference)
+    with np.errstate(over="ignore"):
+        error = np.where(finite, (difference / scale).max(-1), np.inf)
+        ulps = difference / np.spacing(np.maximum(np.abs(reference), 2.0**-126).astype(np.float32))
+    ulps = np.where(finite, ulps.max(-1), np.inf)
+    invalid = ~valid_lookups(lookups)
+    beyond = error > tolerance(f"{gate}.max")
+    explained = np.zeros(len(value), bool)
+    ask = np.flatnonzero(beyond & finite & ~invalid)
+    if len(ask):
+        low, high = rounded_range(representation, lookups[ask], tolerance(f"{gate}.argument_ulps"))
+        slack = tolerance(f"{gate}.max") * scale[ask]
+        explained[ask] = ((safe[ask] >= low - slack) & (safe[ask] <= high + slack)).all(-1)
+    failed = (beyond & ~explained) | (invalid & (value != 0).any(-1))
+    return failed, explained, error, ulps
+
+
+def valid_lookups(lookups):
+    """Where both directions of a lookup count, shape (n,)."""
+    from btfref.conventions import valid_directions
+
+    return valid_directions(lookups.w_light) & valid_directions(lookups.w_view)
+
+
+def rounded_range(representation, lookups, ulps):
+    """Least and largest value of the definition at arguments that are off by their rounding.
+
+    Directions move by ``ulps`` roundoffs of 1 along each axis, coordinates by as many of themselves or of a tile,
+    whichever is more; random points of that box are looked at, a fixed number of them.
+
+    Returns
+    -------
+    low, high : ndarray, shape (n, 3)
+    """
+    rng = np.random.default_rng(0)
+    step = ulps * float(np.finfo(np.float32).eps) / 2
+    uv, w_light, w_view = (np.asarray(a, float) for a in lookups.points)
+    uv = np.where(np.isfinite(uv), uv, 0.0)
+    # A tile far out is a tile: its own rounding is in the argument already, which is exact.
+    low = high = representation.evaluate(uv, w_light, w_view, lod=lookups.lod)
+    for _ in range(NEIGHBOURS):
+        # Sizes over many decades: next to the horizon a change of the last digit turns a ray as far as one of the
+        # first.
+        moved = [
+            a + step * 10 ** rng.uniform(-8, 0, a.shape) * rng.choice([-1.0, 1.0], a.shape)
+            for a in (uv - np.floor(uv), w_light, w_view)
+        ]
+        for w in moved[1:]:
+            w[:, 2] = np.maximum(w[:, 2], 2.0**-126)
+        value = representation.evaluate(*moved, lod=lookups.lod)
+        low, high = np.minimum(low, value), np.maximum(high, value)
+    return low, high
