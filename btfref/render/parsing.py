@@ -9,6 +9,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from btfref.errors import InputError
 
 #: The BSDF plugin that shows a representation.
@@ -180,5 +182,22 @@ def _resolve_file(parsed, node, beside):
         if directory is not None and (directory / name).is_file():
             node.props["filename"] = str((directory / name).resolve())
             return
+    if node.props.plugin_name() == "envmap":
+        _shipped_environment(parsed, node, name)
     if is_btf:
         raise InputError("no such BTF file", file=parsed.location(node), field="filename", got=name)
+
+
+def _shipped_environment(parsed, node, name):
+    """Give an ``envmap`` the picture of a shipped environment that its file name stands for."""
+    import mitsuba as mi
+
+    from btfref.render.environments import NAMES, is_shipped, shipped
+
+    if not is_shipped(name):
+        expected = f"a picture, or {', '.join(NAMES)}"
+        raise InputError(
+            "no such environment", file=parsed.location(node), field="filename", got=name, expected=expected
+        )
+    del node.props["filename"]
+    node.props["bitmap"] = mi.Bitmap(np.ascontiguousarray(shipped(name).radiance))

@@ -184,6 +184,8 @@ def read_scene(scene, parameters=None, *, size=None):
 
 
 def _check(parsed, nodes):
+    import mitsuba as mi
+
     if len(nodes["Sensor"]) != 1:
         raise InputError(
             "one sensor is needed", file=parsed.source, field="sensor", got=len(nodes["Sensor"]), expected=1
@@ -216,7 +218,8 @@ def _check(parsed, nodes):
     for node in parsed.nodes:
         # Objects that were made before cannot be read under another variant.
         for key, value in node.props.items():
-            if type(value).__module__.startswith("mitsuba") and hasattr(value, "class_name"):
+            made = type(value).__module__.startswith("mitsuba") and hasattr(value, "class_name")
+            if made and not isinstance(value, mi.Bitmap):
                 raise InputError("the scene holds a finished Mitsuba object", file=parsed.source, field=key)
 
 
