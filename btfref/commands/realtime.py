@@ -4,7 +4,8 @@ Meshes with BTF materials, a perspective camera, directional and point lights, a
 cast shadows: compare with `btfref render --no-shadows`. The image is the mean of a regular sub-pixel grid (--grid).
 
 --environment says how an envmap lights: "prefiltered" maps, for the methods that have them, "lights", directional
-lights that stand for it, for any method, or "auto", the first of these that there is.
+lights that stand for it, for any method, or "auto", the first of these that there is; "sh", spherical harmonics, for
+methods whose texels share tables (lpca).
 """
 
 from __future__ import annotations
@@ -48,6 +49,10 @@ def add_arguments(parser):
         metavar="N",
         help="that stand for it (default: for an estimated error of 1 %%)",
     )
+    parser.add_argument(
+        "--order", type=count(1), metavar="N", help="bands of spherical harmonics (default 5)"
+    )
+    parser.add_argument("--window", choices=("none", "hanning", "lanczos"), help="that damps their ringing")
     parser.add_argument("--png", action="store_true", help="also write X.png, for eyes")
     parser.add_argument("--json", action="store_true", help="print frame time and OpenGL renderer as JSON")
 
@@ -67,6 +72,8 @@ def run(args):
         views=args.views,
         environment=args.environment,
         lights=args.lights,
+        order=args.order,
+        window=args.window,
     )
     write_images(result.image, out, png=args.png)
     if args.json:

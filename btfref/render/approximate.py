@@ -13,13 +13,13 @@ import numpy as np
 from btfref import representations
 from btfref.errors import InputError
 from btfref.numerics.footprint import ANISOTROPY, probe_weight
-from btfref.render.lighting import Lighting
+from btfref.render.lighting import lighting_of
 from btfref.render.result import RenderResult
 from btfref.render.scene import read_scene
 from btfref.render.visible import visible_points
 
 
-def approximate(scene, *, parameters=None, path="auto", grid=4, size=None, lights=None):
+def approximate(scene, *, parameters=None, path="auto", grid=4, size=None, **options):
     """What :func:`btfref.render.realtime.realtime` approximates, evaluated in float64.
 
     Parameters
@@ -33,8 +33,8 @@ def approximate(scene, *, parameters=None, path="auto", grid=4, size=None, light
         n of the n × n sub-pixel samples, at (i + ½)/n.
     size : (int, int), optional
         Width and height in place of the scene's.
-    lights : int, optional
-        As for ``realtime``.
+    **options
+        ``lights``, ``order`` and ``window`` as for ``realtime``.
 
     Returns
     -------
@@ -53,9 +53,7 @@ def approximate(scene, *, parameters=None, path="auto", grid=4, size=None, light
     description = read_scene(scene, parameters, size=size)
     if not description.lights and description.environment is None:
         raise InputError("the scene has no light", file=description.source, field="emitter")
-    lighting = None
-    if description.environment is not None:
-        lighting = Lighting(description.environment, path, lights=lights)
+    lighting = lighting_of(description, path, **options)
     start = time.perf_counter()
     reps, prepared, total = {}, {}, None
     for points in visible_points(scene, description, parameters=parameters, size=size, grid=grid):

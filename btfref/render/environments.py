@@ -1,7 +1,7 @@
 """Environments that ship by construction, by name: what ``-D environment=NAME`` knows beside files.
 
-Pictures have Mitsuba's conventions (:mod:`btfref.render.environment`); the scenes turn their upper edge towards z, and so
-does :data:`Z_UP`, in which the directions here are given.
+Pictures have Mitsuba's conventions (:mod:`btfref.render.environment`); the scenes turn their upper edge towards z, and
+so does :data:`Z_UP`: directions here are the world's.
 """
 
 from __future__ import annotations

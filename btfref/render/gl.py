@@ -144,7 +144,7 @@ class ShaderRepresentation:
         shader, directories = shader_file(rep)
         arrays = rep.port_arrays()
         if light is not None:
-            defines |= light_defines(light.tables)
+            defines |= light_defines(light.tables, light.constants)
             arrays = {**arrays, **packed_arrays(light.tables)}
         textures = {name: upload(ctx, array, name) for name, array in arrays.items()}
         texels = tuple(rep.meta.get("texels", (1, 1)))
@@ -175,12 +175,13 @@ def shader_defines(rep, *, filter_type=None):
     return {**composer.representation_defines(rep), "FILTER_BILINEAR": filter_type == "bilinear"}
 
 
-def light_defines(tables):
-    """Constants of the shader that reads the tables of a way to light: their shapes before padding."""
-    shapes = {
-        f"{name}_DIM{axis}".upper(): n for name, table in tables.items() for axis, n in enumerate(table.shape)
-    }
-    return {**shapes, "HAS_ENVIRONMENT": True}
+def light_defines(tables, constants=None):
+    """Constants of the shader that reads the tables of a way to light: their shapes and strides, and its own."""
+    defines = {"HAS_ENVIRONMENT": True, **(constants or {})}
+    for name, table in tables.items():
+        defines |= {f"{name}_DIM{axis}".upper(): n for axis, n in enumerate(table.shape)}
+        defines[f"{name}_STRIDE".upper()] = -(-table.shape[-1] // 4)
+    return defines
 
 
 def shader_file(rep):

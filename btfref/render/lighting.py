@@ -1,8 +1,8 @@
 """Ways to light a representation by an environment: one place that knows which there are and what each needs.
 
-``lights`` works for every method; ``prefiltered`` where the registry names a class for it. A way that is
-made ready for a representation holds a GLSL file with ``btf_environment``, the tables that it reads, and the same
-approximation in float64.
+``lights`` works for every method; ``prefiltered`` where the registry names a class for it; ``sh`` where texels share
+tables over lights. A way that is made ready for a representation holds a GLSL file with ``btf_environment``, the tables
+that it reads, and the same approximation in float64.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from functools import cached_property
 import numpy as np
 
 from btfref.errors import InputError
+from btfref.numerics import harmonics
 from btfref.registry import image_light, methods
+from btfref.render import harmonic_light
 from btfref.render.light_set import light_set
 from btfref.render.paths import PATHS
 
@@ -39,6 +41,8 @@ class Prepared:
         indices.
     facts : dict
         JSON-able: for the picture's ``meta``.
+    constants : dict
+        Of the GLSL file.
     """
 
     path: str
@@ -46,6 +50,7 @@ class Prepared:
     tables: dict
     radiance: object
     facts: dict = field(default_factory=dict)
+    constants: dict = field(default_factory=dict)
 
 
 class Lighting:
@@ -54,9 +59,13 @@ class Lighting:
     Parameters
     ----------
     environment : btfref.render.environment.Environment
-    path : {"auto", "prefiltered", "lights"}
+    path : {"auto", "prefiltered", "lights", "sh"}
     lights : int, optional
         Of the path "lights"; see :func:`btfref.render.light_set.light_set`.
+    order : int
+        Bands of spherical harmonics of the path "sh".
+    window : {"none", "hanning", "lanczos"}, optional
+        That damps their ringing.
 
     Raises
     ------
@@ -64,7 +73,7 @@ class Lighting:
         For an unknown way.
     """
 
-    def __init__(self, environment, path="auto", *, lights=None):
+    def __init__(self, environment, path="auto", *, lights=None, order=harmonic_light.ORDER, window=None):
         if path not in PATHS:
             raise InputError(
                 "unknown way to light", field="environment", got=repr(path), expected=", ".join(PATHS)
@@ -72,11 +81,18 @@ class Lighting:
         if lights is not None and path not in ("auto", "lights"):
             raise InputError("only the path 'lights' has a number of lights", field="lights", got=lights)
         self.environment, self.path, self._count = environment, path, lights
+        self._order, self._window = harmonics.checked_order(order), window
+        harmonics.window(window, order)
 
     @cached_property
     def light_set(self):
         """The lights that stand for the environment."""
         return light_set(self.environment, lights=self._count)
+
+    @cached_property
+    def coefficients(self):
+        """The environment in spherical harmonics, world space, shape (order², 3)."""
+        return harmonic_light.environment_coefficients(self.environment, self._order, window=self._window)
 
     def prepared(self, representation, *, file=None):
         """The way for a representation.
@@ -135,3 +151,39 @@ class Lighting:
         facts = {"environment_lights": len(found), "estimated_error": found.error}
         tables = {"environment_lights": found.table()}
         return Prepared("lights", "environment/lights.glsl", tables, radiance, facts)
+
+    def _sh(self, representation, file):
+        order, light = self._order, self.coefficients
+        found = harmonic_light.table_coefficients(representation, order, file=file)
+        stored = found.astype(np.float32)
+
+        def radiance(uv, w_view, to_world, evaluate=None):
+            return harmonic_light.radiance(representation, stored, light, uv, w_view, to_world)
+
+        tables = {
+            "environment_harmonics": light.astype(np.float32),
+            "harmonic_turn": harmonic_light.turn_table(order),
+            "eigen_harmonics": stored.reshape(*stored.shape[:3], -1),
+        }
+        facts = {
+            "order": order,
+            "window": self._window or "none",
+            "ringing": harmonics.ringing(light, order),
+        }
+        shader = representation.harmonic_shader
+        return Prepared("sh", shader, tables, radiance, facts, {"HARMONIC_ORDER": order})
+
+
+def lighting_of(scene, path="auto", **options):
+    """The :class:`Lighting` of a scene's environment, or None without one.
+
+    Parameters
+    ----------
+    scene : SceneDescription
+    path : str
+    **options
+        Of :class:`Lighting`; None leaves the default.
+    """
+    if scene.environment is None:
+        return None
+    return Lighting(scene.environment, path, **{k: v for k, v in options.items() if v is not None})

@@ -16,7 +16,7 @@ from btfref import representations
 from btfref.demand import scene_views
 from btfref.errors import BtfrefError, InputError
 from btfref.render import gl
-from btfref.render.lighting import Lighting
+from btfref.render.lighting import lighting_of
 from btfref.render.result import RenderResult
 from btfref.render.scene import SceneDescription, read_scene
 from btfref.render.shapes import neighbours
@@ -31,6 +31,8 @@ def realtime(
     views="all",
     environment="auto",
     lights=None,
+    order=None,
+    window=None,
     count_fetches=False,
 ):
     """Render a scene with OpenGL.
@@ -51,6 +53,10 @@ def realtime(
         Way in which the scene's environment lights: see :class:`btfref.render.lighting.Lighting`.
     lights : int, optional
         Directional lights that stand for the environment; by default as many as it needs for an estimated error of 1 %.
+    order : int, optional
+        Bands of spherical harmonics; default 5.
+    window : {"none", "hanning", "lanczos"}, optional
+        That damps their ringing.
     count_fetches : bool
         Count the texels that the representations fetch: ``meta["fetches"]``, the mean over covered samples.
 
@@ -87,7 +93,7 @@ def realtime(
     def load_needed(path):
         return representations.load(path, views=needed[path])
 
-    lighting = None if scene.environment is None else Lighting(scene.environment, environment, lights=lights)
+    lighting = lighting_of(scene, environment, lights=lights, order=order, window=window)
     load_file = load_needed if needed else None
     with Renderer(scene, load_file, lighting=lighting, count_fetches=count_fetches) as renderer:
         offsets = [((i + 0.5) / grid, (j + 0.5) / grid) for j in range(grid) for i in range(grid)]
@@ -164,8 +170,8 @@ class Renderer:
         self._near, self._far = _clip(self.camera, scene.meshes)
         self._lights = _light_uniforms(scene.lights) if scene.lights else {}
         self._n_lights, self._lighting = len(scene.lights), lighting
-        if lighting is None and scene.environment is not None:
-            self._lighting = Lighting(scene.environment)
+        if lighting is None:
+            self._lighting = lighting_of(scene)
         self._light_facts = {}
         self._counting = {"COUNT_FETCHES": 1} if count_fetches else {}
         try:

@@ -71,6 +71,25 @@ class Representation(StoredMaps):
         basis = np.moveaxis(self.maps["basis"], 1, 3)
         return packed_arrays(self.maps, basis=basis.reshape(*basis.shape[:3], -1))
 
+    #: GLSL files that light the clusters' tables by spherical harmonics, and by them after transfer through a mesh.
+    harmonic_shader = "environment/lpca_harmonics.glsl"
+    transfer_shader = "environment/lpca_transfer.glsl"
+
+    def shared_tables(self):
+        """The tables over views and lights that texels share, and how texels combine them.
+
+        Returns
+        -------
+        tables : ndarray of float, shape (cluster, 1 + component, view, light, 3)
+            The cluster's mean first.
+        cluster : ndarray of int64, shape (texels,)
+        coefficient : ndarray of float64, shape (texels, 1 + component)
+            ``B_x = Σ_m coefficient[x, m] tables[cluster[x], m]``; the first one is 1.
+        """
+        cluster = self.maps["cluster"].reshape(-1).astype(np.int64)
+        weights = self.maps["weights"].reshape(len(cluster), -1).astype(float)
+        return self.maps["basis"], cluster, np.concatenate([np.ones((len(weights), 1)), weights], 1)
+
     def sampling_tables(self):
         """Groups of texels alike, and their means."""
         basis = conventions.luminance(self.maps["basis"].astype(np.float32))

@@ -12,6 +12,14 @@ uniform sampler2DArray basis;
 uniform sampler2DArray weights;
 uniform usampler2DArray cluster;
 
+// Weight of the cluster's mean, and of its eigen-BRDFs in a texel.
+void lpca_coefficients(int texel, out float coefficient[PACKET_COLOURS]) {
+    coefficient[0] = 1.0;
+    for (int c = 1; c < PACKET_COLOURS; ++c) {
+        coefficient[c] = table_fetch(weights, texel * WEIGHTS_STRIDE + ((c - 1) >> 2))[(c - 1) & 3];
+    }
+}
+
 vec3 btf_eval(vec2 uv, vec3 w_light, vec3 w_view, float lod) {
     if (!directions_valid(w_light, w_view)) {
         return vec3(0.0);
@@ -27,10 +35,7 @@ vec3 btf_eval(vec2 uv, vec3 w_light, vec3 w_view, float lod) {
         }
         int texel = texels.index[x];
         float coefficient[PACKET_COLOURS];
-        coefficient[0] = 1.0;
-        for (int c = 1; c < PACKET_COLOURS; ++c) {
-            coefficient[c] = table_fetch(weights, texel * WEIGHTS_STRIDE + ((c - 1) >> 2))[(c - 1) & 3];
-        }
+        lpca_coefficients(texel, coefficient);
         int first = int(table_fetch(cluster, texel * CLUSTER_STRIDE).r) * BASIS_DIM1;
         vec3 texel_sum = vec3(0.0);
         for (int v = 0; v < 4; ++v) {

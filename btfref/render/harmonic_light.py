@@ -1,0 +1,150 @@
+"""Light in spherical harmonics on methods whose texels share a few tables over views and lights.
+
+Source: G. Müller, J. Meseth, R. Klein, "Fast Environmental Lighting for Local-PCA Encoded BTFs", CGI 2004, section 4.2:
+``L_r(x, v) = ⟨b^(x,v), M_p a⟩`` with the environment's coefficients a, the rotation M_p into the local frame, and the
+coefficients b of the mean and the eigen-BRDFs, per view. Differs from it in the projection: the interpolated table is
+integrated, not the measured samples alone, whose quadrature is exact for two bands only.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from btfref import conventions
+from btfref.errors import InputError
+from btfref.numerics import harmonics, interpolation
+from btfref.numerics.quadrature import gauss_hemisphere
+
+#: Bands of the paper.
+ORDER = 5
+
+#: Nodes in cos θ and φ that integrate a table: steps of φ that the measured azimuths are whole numbers of.
+NODES = 128, 720
+
+#: Cells that stand for a picture when it is projected: 0.7 degrees each.
+CELL_ROWS = 256
+
+#: Points evaluated at a time in float64.
+CHUNK = 1 << 11
+
+
+def shared_tables(representation, attribute, *, file=None):
+    """``representation.shared_tables()`` of a method that has ``attribute``.
+
+    Raises
+    ------
+    InputError
+        For a method without tables that texels share.
+    """
+    if not hasattr(representation, attribute):
+        from btfref.registry import methods
+
+        having = [key for key, row in methods().items() if hasattr(row.representation, attribute)]
+        raise InputError(
+            "spherical harmonics need tables over lights that texels share",
+            file=file,
+            field="method",
+            got=representation.meta["method"],
+            expected=f"one of {', '.join(having)}",
+        )
+    return representation.shared_tables()
+
+
+def environment_coefficients(environment, order, *, window=None):
+    """Coefficients of an environment in world space.
+
+    Parameters
+    ----------
+    environment : btfref.render.environment.Environment
+    order : int
+    window : str, optional
+        See :func:`btfref.numerics.harmonics.window`.
+
+    Returns
+    -------
+    ndarray of float64, shape (order², 3)
+    """
+    w, power = environment.cells(CELL_ROWS)
+    lit = np.flatnonzero(power.any(1))
+    total = np.zeros((order * order, 3))
+    for first in range(0, len(lit), 1 << 14):
+        part = lit[first : first + (1 << 14)]
+        total += harmonics.values(w[part], order).T @ power[part]
+    return harmonics.window(window, order)[:, None] * total
+
+
+def light_projection(representation, order):
+    """Matrix from values at the measured lights to the coefficients of what is interpolated between them.
+
+    Returns
+    -------
+    ndarray of float64, shape (order², n_lights)
+    """
+    arrays = representation.arrays()
+    lights = interpolation.from_arrays(arrays, "light")
+    w, weight = gauss_hemisphere(*NODES)
+    index, share = lights.stencil(w, hold=False)
+    weighted = harmonics.values(w, order) * weight[:, None]
+    n = len(arrays["light_directions"])
+    flat = index.ravel()
+    return np.stack([np.bincount(flat, (share * y[:, None]).ravel(), n) for y in weighted.T])
+
+
+def table_coefficients(representation, order, *, file=None):
+    """Coefficients of the shared tables over the light.
+
+    Returns
+    -------
+    ndarray of float64, shape (cluster, view, order², 1 + component, 3)
+    """
+    tables, _, _ = shared_tables(representation, "harmonic_shader", file=file)
+    projection = light_projection(representation, order)
+    k, m, v, n, _ = tables.shape
+    flat = np.moveaxis(tables.astype(np.float32), 3, 0).reshape(n, -1)
+    found = (projection @ flat).reshape(order * order, k, m, v, 3)
+    return found.transpose(1, 3, 0, 2, 4)
+
+
+def turn_table(order):
+    """Quarter turn about x for shaders: row i of the block of its band, float32 (order², 2 · order − 1)."""
+    matrix, table = harmonics.quarter_turn(order), np.zeros((order * order, 2 * order - 1), np.float32)
+    for band in range(order):
+        block = slice(band * band, (band + 1) ** 2)
+        table[block, : 2 * band + 1] = matrix[block, block]
+    return table
+
+
+def radiance(representation, coefficients, light, uv, w_view, to_world):
+    """⟨b, M a⟩ in float64.
+
+    Parameters
+    ----------
+    representation : Representation
+    coefficients : ndarray, shape (cluster, view, order², 1 + component, 3)
+    light : ndarray, shape (order², 3)
+    uv, w_view, to_world : ndarray, shape (N, 2), (N, 3), (N, 3, 3)
+
+    Returns
+    -------
+    ndarray of float64, shape (N, 3)
+    """
+    order = int(np.sqrt(len(light)))
+    _, cluster, weights = representation.shared_tables()
+    meta = representation.meta
+    views = interpolation.from_arrays(representation.arrays(), "view")
+    uv, w_view, to_world = (np.asarray(a, float) for a in (uv, w_view, to_world))
+    result = np.zeros((len(uv), 3))
+    for first in range(0, len(uv), CHUNK):
+        at = first + np.flatnonzero(conventions.valid_directions(w_view[first : first + CHUNK]))
+        if not len(at):
+            continue
+        local = harmonics.rotate(light, to_world[at], order)
+        texel, texel_weight = conventions.texel_stencil(uv[at], meta["texels"], meta["filter_type"])
+        view, view_weight = views.stencil(w_view[at])
+        for t in range(texel.shape[1]):
+            own = cluster[texel[:, t]]
+            for v in range(view.shape[1]):
+                share = (texel_weight[:, t] * view_weight[:, v])[:, None]
+                seen = np.einsum("nimc,nm->nic", coefficients[own, view[:, v]], weights[texel[:, t]])
+                result[at] += share * np.einsum("nic,nic->nc", seen, local)
+    return result
