@@ -265,16 +265,40 @@ def _parent(filename):
     return {"max_depth": depth, **(ancestor or {})}
 
 
+def mesostructure_of(filename):
+    """The mesostructure that a representation was made from, and the path depth of its synthesis.
+
+    Parameters
+    ----------
+    filename : path-like
+
+    Returns
+    -------
+    Mesostructure, int
+
+    Raises
+    ------
+    InputError
+        When the file does not say, or the geometry that it names has changed.
+    """
+    parent = _parent(filename)
+    return _built(filename, parent), parent.get("max_depth", 8)
+
+
 def _mesostructure(plane, parent, given):
+    from btfref.mesostructure import build
+
+    return _built(plane.filename, parent) if given is None else build(given)
+
+
+def _built(filename, parent):
     from btfref.mesostructure import FROM_FILES, build
     from btfref.sampling.job import fingerprint
 
-    if given is not None:
-        return build(given)
     if "name" not in parent:
         raise InputError(
             "the BTF does not say which mesostructure it shows",
-            file=plane.filename,
+            file=filename,
             field="parent",
             expected="a synthetic BTF",
         )

@@ -233,8 +233,11 @@ def tell_camera(scene, share):
     parameters.update()
 
 
-def film_rays(sensor, offset):
+def film_rays(sensor, offset, pixel=None):
     """Camera rays through the point ``offset`` of every pixel (from its top left corner), row by row.
+
+    The offset is a pair of numbers, or of mitsuba.Float with one for each ray; ``pixel`` (mitsuba.UInt32) chooses
+    pixels by their flat index.
 
     Returns
     -------
@@ -245,10 +248,10 @@ def film_rays(sensor, offset):
     import mitsuba as mi
 
     width, height = (int(n) for n in sensor.film().crop_size())
-    index = dr.arange(mi.UInt32, width * height)
+    index = dr.arange(mi.UInt32, width * height) if pixel is None else pixel
     x, y = mi.Float(index % width), mi.Float(index // width)
     # The offset is data, not code: all sub-pixel samples share one kernel.
-    ox, oy = (dr.opaque(mi.Float, float(o)) for o in offset)
+    ox, oy = (o if dr.is_array_v(o) else dr.opaque(mi.Float, float(o)) for o in offset)
     position = mi.Point2f((x + ox) / width, (y + oy) / height)
     ray, weight = sensor.sample_ray(mi.Float(0), mi.Float(0.5), position, mi.Point2f(0.5))
     return ray, weight
