@@ -349,6 +349,8 @@ def _measure(entry, name, table, comparison, mask):
         if entry == "failing_fraction":
             return float(np.mean(error > table["failing_above"]))
         return metrics.percentiles(error)[entry]
+    if entry == "lost_negative":
+        return metrics.lost_negative(t, r)
     if entry in ("rejected_fraction", "relative_rmse"):
         if comparison.variance is None:
             return Measured(None, "fail", "needs the variance of the reference, none was given")

@@ -144,6 +144,16 @@ def relative_error(test, reference, *, floor=FLOOR, largest=None):
     )
 
 
+def lost_negative(test, reference):
+    """Largest negative part of the reference that the test lacks, over the largest absolute reference value.
+
+    A renderer that clamps in silence hides what a lossy method undershoots, and with it part of its error.
+    """
+    t, r = paired(test, reference)
+    lost = np.maximum(-r, 0) - np.maximum(-t, 0)
+    return _ratio(float(np.max(np.maximum(lost, 0))), float(np.max(np.abs(r))))
+
+
 def percentiles(error):
     """Percentiles p50, p99, p999 and max of an error: the smallest entry with that share at or below it.
 

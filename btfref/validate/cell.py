@@ -1,0 +1,214 @@
+"""One cell of the matrix: its pictures along the whole chain, the waterfall of their errors, the gates."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from btfref.compare import compare, json_safe
+from btfref.compare.colour import Display, decode_srgb, fit_display
+from btfref.compare.gates import GateResult, missing_reference
+from btfref.compare.waterfall import Picture, waterfall
+from btfref.errors import BtfrefError
+from btfref.scenes import scene_file
+from btfref.validate.cache import code_of, key_of
+from btfref.validate.material import fit_key
+from btfref.validate.pictures import fitted, make_views, views_key
+
+#: Gates of a picture in real time against the reference under delta lights.
+GATES = (
+    "image.noise_free",
+    "image.silhouette",
+    "image.mesostructure",
+    "image.background",
+    "image.negative",
+)
+
+#: Names of the stages between pictures under delta lights.
+STAGES = ("sampled BTF", "fit", "port", "real time", "8 bits")
+
+
+@dataclass(frozen=True, eq=False)
+class CellResult:
+    """What a cell of the matrix found.
+
+    Parameters
+    ----------
+    facts : dict
+        JSON-able: ``name``, the axes, ``waterfall``, ``gates``, ``seconds``, ``file``, ``notes``.
+    images : dict of str to (H, W, 3) float32 array
+        ``truth``, ``reference``, ``realtime``.
+    classes : (H, W) uint8 array or None
+    """
+
+    facts: dict
+    images: dict
+    classes: np.ndarray | None = None
+
+    @property
+    def outcome(self):
+        """``pass``, ``inconclusive`` or ``fail``."""
+        outcomes = {gate["outcome"] for gate in self.facts["gates"]}
+        if not outcomes or "fail" in outcomes:
+            return "fail"
+        return "inconclusive" if "inconclusive" in outcomes else "pass"
+
+    @property
+    def gates(self):
+        """The gates as `GateResult`."""
+        return tuple(gate_from(facts) for facts in self.facts["gates"])
+
+    def comparison(self):
+        """The comparison of both renderers once more, with its maps."""
+        keys = self.facts.get("image_gates")
+        if not self.images or keys is None:
+            return None
+        return compare(self.images["realtime"], self.images["reference"], classes=self.classes, gate=keys)
+
+
+def gate_from(facts):
+    """A `GateResult` from its JSON."""
+    names = {"class": "pixel_class"}
+    values = {names.get(key, key): value for key, value in facts.items()}
+    for key in ("value", "limit"):
+        values[key] = float(values[key]) if isinstance(values[key], str) else values[key]
+    return GateResult(**values)
+
+
+def cell_key(spec, settings):
+    """Key of a cell: its fit, the pictures it shares, the code and the tolerances."""
+    return key_of(
+        {
+            "cell": fit_key(spec.mesostructure, spec.method, settings),
+            "views": views_key(spec.mesostructure, spec.scene, spec.lights, settings),
+            "code": code_of("picture", spec.method),
+        }
+    )
+
+
+def make_cell(cache, spec, settings):
+    """Compute a cell, or read it.
+
+    Returns
+    -------
+    CellResult
+    """
+    key = cell_key(spec, settings)
+    if not cache.has(key, ".cell.npz"):
+        try:
+            made = _cell(cache, spec, settings)
+        except BtfrefError as error:
+            # Not kept: what is missing may be there the next time.
+            return failed_cell(spec, str(error))
+        cache.write(key, ".cell.npz", lambda path: _save(path, made))
+    return read_cell(cache.path(key, ".cell.npz"))
+
+
+def failed_cell(spec, why):
+    """A cell whose reference, or whose picture, could not be made: a failure of every gate."""
+    gates = [g.to_dict() for key in GATES for g in missing_reference(key, why)]
+    facts = {"name": spec.name, **vars(spec), "gates": gates, "notes": why, "waterfall": None}
+    return CellResult(json_safe(facts), {})
+
+
+def read_cell(path):
+    """A cell from its file."""
+    with np.load(path) as stored:
+        images = {name[6:]: stored[name] for name in stored.files if name.startswith("image_")}
+        return CellResult(json.loads(str(stored["facts"])), images, stored["classes"])
+
+
+def _save(path, result):
+    images = {f"image_{name}": image for name, image in result.images.items()}
+    np.savez_compressed(path, facts=json.dumps(result.facts), classes=result.classes, **images)
+
+
+def _cell(cache, spec, settings):
+    from btfref.render.definition import render_definition
+    from btfref.render.realtime import realtime
+    from btfref.render.reference import render
+    from btfref.representations.container import read_info
+
+    start = time.perf_counter()
+    file, path = fitted(cache, spec, settings), scene_file(spec.scene)
+    views = make_views(cache, spec.mesostructure, spec.scene, spec.lights, settings)
+    size = (settings.size, settings.size)
+    shared = {"parameters": {"btf": str(file), "lights": spec.lights}, "size": size}
+    definition = render_definition(path, grid=settings.grid, **shared)
+    reference = render(path, noise_free=settings.grid, shadows=False, **shared)
+    image = realtime(path, grid=settings.grid, **shared)
+
+    display = fit_display(views.truth.mean(0), views.classes > 0)
+    counts = np.isin(views.classes, (1, 3))
+    chain = [
+        Picture("geometry", views.truth),
+        Picture(STAGES[0], views.sampled[None]),
+        Picture(STAGES[1], definition.image[None]),
+        Picture(STAGES[2], reference.image[None]),
+        Picture(STAGES[3], image.image[None]),
+        Picture(STAGES[4], eight_bits(image.image, display)[None]),
+    ]
+    found = waterfall(chain, counts, display)
+    comparison = compare(image.image, reference.image, classes=views.classes, gate=GATES)
+    facts = {
+        "name": spec.name,
+        **vars(spec),
+        "gates": [gate.to_dict() for gate in (*comparison.gates, *found.gates)],
+        "image_gates": list(GATES),
+        "metrics": {name: comparison.metrics.get(name, {}) for name in ("interior", "all")},
+        "waterfall": {
+            **found.to_dict(),
+            "sampling": sampling_noise(views, counts),
+            "display": display.to_dict(),
+        },
+        "bytes": read_info(file)["payload_bytes"],
+        "seconds": {
+            "definition": definition.meta["seconds"],
+            "reference": reference.meta["seconds"],
+            "cell": time.perf_counter() - start,
+        },
+        "frame_ms": image.meta["frame_ms"],
+        "negative_fraction": image.meta["negative_fraction"],
+        "gl_renderer": image.meta["gl_renderer"],
+        "notes": f"{found.explanation} Both renderers read one file and one scene; neither casts shadows.",
+    }
+    images = {"truth": views.truth.mean(0), "reference": reference.image, "realtime": image.image}
+    return CellResult(json_safe(facts), images, views.classes)
+
+
+def eight_bits(image, display):
+    """What a display of 8 bits shows, as linear radiance: scaled, clipped, coded, decoded.
+
+    Parameters
+    ----------
+    image : (..., 3) array
+        Linear radiance.
+    display : Display
+
+    Returns
+    -------
+    (..., 3) float32 array
+    """
+    codes = np.rint(255 * display.encoded(image))
+    return (decode_srgb(codes / 255) / 2.0**display.stops).astype(np.float32)
+
+
+def sampling_noise(views, mask):
+    """How much of the first stage is Monte Carlo noise of the sampled BTF, by its independent twin.
+
+    Returns
+    -------
+    dict
+        ``mse``: mean square without that noise, directions and texels alone; ``noise``: that of the noise.
+    """
+    a, b = (views.sampled - views.truth[0])[mask], (views.twin - views.truth[1])[mask]
+    noise = 0.5 * np.mean((views.sampled - views.twin)[mask].astype(float) ** 2)
+    return {"mse": float(np.mean(a * b, dtype=float)), "noise": float(noise)}
+
+
+def restored_display(facts):
+    """The display of a cell's waterfall."""
+    return Display(facts["waterfall"]["display"]["stops"])

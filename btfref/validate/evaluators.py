@@ -1,0 +1,186 @@
+"""A method's three evaluators against each other, and its sampling against its density."""
+
+from __future__ import annotations
+
+import tempfile
+from contextlib import chdir
+
+import numpy as np
+
+from btfref.compare.comparison import agreement
+from btfref.compare.gates import Measured, judge
+from btfref.compare.tolerances import tolerance
+from btfref.validate.probes import hit_allowance, probe_points
+
+#: Lookups of each evaluator.
+PROBES = 8000
+
+#: Texture coordinates and views of the χ² tests: a texel's middle and a place between texels, steep and grazing.
+UVS = ((0.31, 0.47), (0.83, 0.12))
+VIEWS = {"normal": (0.0, 0.0, 1.0), "oblique": (0.5, -0.4, 0.77), "grazing": (0.1, 0.99, 0.08)}
+
+
+def plugin_values(path, uv, w_light, w_view, **parameters):
+    """Values of a representation by its Dr.Jit port.
+
+    Parameters
+    ----------
+    path : path-like
+    uv, w_light, w_view : ndarray, shape (N, 2), (N, 3), (N, 3)
+    **parameters
+        Of the plugin.
+
+    Returns
+    -------
+    ndarray of float32, shape (N, 3)
+    """
+    mi, plugin = _plugin(path, **parameters)
+    value = plugin.eval(mi.BSDFContext(), _interaction(mi, uv, w_view), mi.Vector3f(np.asarray(w_light).T))
+    return np.array(value).T
+
+
+def probe_gates(path, *, seed=7):
+    """Both ports against the float64 definition at ordinary and awkward lookups.
+
+    Parameters
+    ----------
+    path : path-like
+        A representation.
+    seed : int
+
+    Returns
+    -------
+    list of GateResult
+        ``probe.agreement`` of Dr.Jit, then of GLSL, and ``probe.finite``; the detail says whose.
+    """
+    from btfref.numerics.directions import DirectionSet
+    from btfref.render.probe import probe
+    from btfref.representations import load
+
+    representation = load(path)
+    arrays = representation.arrays()
+    views, lights = (
+        DirectionSet(arrays[f"{name}_directions"].astype(float), "custom") for name in ("view", "light")
+    )
+    points = probe_points(np.random.default_rng(seed), PROBES, views, lights)
+    reference = representation.evaluate(*points)
+    gates, bad = [], 0
+    for name, value in (("Dr.Jit", plugin_values(path, *points)), ("GLSL", probe(representation, *points))):
+        allowance = hit_allowance(representation, value, reference, points)
+        found = agreement(value, reference, allowance=allowance)
+        gates += [_named(gate, name) for gate in found.gates]
+        bad += int(np.count_nonzero(~np.isfinite(value)))
+    return gates + judge("probe.finite", {"nonfinite": Measured(bad)})
+
+
+def _named(gate, whose):
+    from dataclasses import replace
+
+    return replace(gate, detail=f"{whose}{': ' if gate.detail else ''}{gate.detail}")
+
+
+def sampling_gates(path, *, samples):
+    """χ² of `sample()` against `pdf()`, and its weights against value over density.
+
+    Parameters
+    ----------
+    path : path-like
+        A representation.
+    samples : int
+        Of each of the tests; their significance is Šidák-corrected.
+
+    Returns
+    -------
+    list of GateResult
+        ``chi2`` with the smallest p-value's test, ``sample.weight``, ``sample.pdf``.
+    """
+    mi, plugin = _plugin(path)
+    results, weights, pdfs = [], [], []
+    with (
+        tempfile.TemporaryDirectory() as scratch,
+        chdir(scratch),
+    ):  # the test writes its tables where it stands
+        for name, view in VIEWS.items():
+            w_view = np.asarray(view) / np.linalg.norm(view)
+            for uv in UVS:
+                results.append((f"{name} view, uv {uv}", *_chi2(mi, plugin, uv, w_view, samples)))
+                weight, pdf = _weights(mi, plugin, uv, w_view)
+                weights.append(weight)
+                pdfs.append(pdf)
+    failed = [f"{where}: {message}" for where, right, message in results if not right]
+    detail = "; ".join(failed) or f"{len(results)} tests of {samples} samples"
+    rejected = Measured(len(failed), "fail" if failed else "pass", detail)
+    return [
+        *judge("chi2.rejected", {"tests": rejected}),
+        *judge("sample.weight", {"max": max(weights)}),
+        *judge("sample.pdf", {"max": max(pdfs)}),
+    ]
+
+
+def _chi2(mi, plugin, uv, w_view, samples):
+    """Whether one χ² test passes, and what it says if not."""
+    import drjit as dr
+
+    context = mi.BSDFContext()
+
+    def sample(s):
+        bs, _ = plugin.sample(context, _place(mi, dr.width(s), uv, w_view), s[0], mi.Point2f(s[1], s[2]))
+        return bs.wo, dr.select(bs.pdf > 0, mi.Float(1), 0)
+
+    def pdf(w):
+        return plugin.pdf(context, _place(mi, dr.width(w), uv, w_view), w)
+
+    test = mi.chi2.ChiSquareTest(
+        domain=mi.chi2.SphericalDomain(),
+        sample_func=sample,
+        pdf_func=pdf,
+        sample_dim=3,
+        sample_count=samples,
+        ires=16,
+    )
+    right = test.run(tolerance("chi2.significance"), test_count=len(UVS) * len(VIEWS), quiet=True)
+    return bool(right), " ".join(str(test.messages).split())[-200:]
+
+
+def _weights(mi, plugin, uv, w_view, n=1 << 13):
+    """Largest error of weight × density against the value, and of the density, relative."""
+    rng, context = np.random.default_rng(5), mi.BSDFContext()
+    si = _place(mi, n, uv, w_view)
+    bs, weight = plugin.sample(context, si, mi.Float(rng.random(n)), mi.Point2f(rng.random((2, n))))
+    value, pdf = np.array(plugin.eval(context, si, bs.wo)), np.array(plugin.pdf(context, si, bs.wo))
+    floor = 1e-3 * max(float(np.abs(value).max()), 1e-30)
+    error = np.abs(np.array(weight) * pdf - value) / np.maximum(np.abs(value), floor)
+    return float(error.max()), float((np.abs(np.array(bs.pdf) - pdf) / np.maximum(pdf, 1e-30)).max())
+
+
+def _plugin(path, **parameters):
+    from btfref.platform import prepare_llvm
+    from btfref.render import parsing
+
+    prepare_llvm()
+    import mitsuba as mi
+
+    import mitsuba_plugins
+
+    if mi.variant() is None or "llvm" not in mi.variant():
+        parsing.use_variant("llvm_ad_rgb")
+    mitsuba_plugins.register()
+    return mi, mi.load_dict({"type": "btf", "filename": str(path), **parameters})
+
+
+def _interaction(mi, uv, w_view):
+    import drjit as dr
+
+    si = dr.zeros(mi.SurfaceInteraction3f, len(w_view))
+    si.uv, si.wi = mi.Point2f(np.asarray(uv).T), mi.Vector3f(np.asarray(w_view).T)
+    return si
+
+
+def _place(mi, n, uv, w_view):
+    import drjit as dr
+
+    si = dr.zeros(mi.SurfaceInteraction3f, n)
+    # Data, not code: one kernel serves all places.
+    si.uv = mi.Point2f(*(dr.opaque(mi.Float, float(x)) for x in uv))
+    si.wi = mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in w_view))
+    return si

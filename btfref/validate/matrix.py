@@ -1,0 +1,139 @@
+"""The axes of the matrix, what a run computes of it, and how finely."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+
+from btfref.errors import InputError
+from btfref.registry import methods
+from btfref.scenes import scene_file
+
+#: Scenes that show a BTF on a shape of their own: flat, curved, folded and seen from both sides.
+SCENES = ("plane", "sphere", "cloth")
+
+#: Lights of the scenes → how they light. Deltas can be compared without noise.
+LIGHTS = {"directional1": "delta", "directional3": "delta", "points2": "delta"}
+
+MESOSTRUCTURES = ("checker", "rings", "tissue")
+
+#: What the quick run shows of each method: every scene once, every kind of light once.
+QUICK_VIEWS = (("plane", "directional1"), ("sphere", "directional3"), ("cloth", "points2"))
+
+
+@dataclass(frozen=True, order=True)
+class Spec:
+    """One cell of the matrix.
+
+    Parameters
+    ----------
+    mesostructure, method, scene, lights : str
+    """
+
+    mesostructure: str
+    method: str
+    scene: str
+    lights: str
+
+    @property
+    def name(self):
+        """For people, and unique."""
+        return f"{self.method} · {self.scene} · {self.lights} · {self.mesostructure}"
+
+    @property
+    def slug(self):
+        """The same for files."""
+        return "-".join((self.mesostructure, self.method, self.scene, self.lights))
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How finely the matrix is computed; all of it enters the keys of what is cached.
+
+    Parameters
+    ----------
+    texels : int
+        Along each side of the tile.
+    directions : str
+        Views and lights of the sampled BTF.
+    estimator : str
+    spp : int
+        Of the synthesis.
+    size : int
+        Edge of the pictures in pixels.
+    grid : int
+        Sub-pixels per axis, the same in all renderers.
+    truth_spp : int
+        Paths per pixel and batch of the truth; there are four batches.
+    environment_spp : int
+        The same of the path-traced reference under an environment.
+    held_out_texels : int
+        Texels along each side for the fits that leave directions out.
+    chi2_samples : int
+        Samples of each χ² test.
+    seed : int
+    """
+
+    texels: int = 64
+    directions: str = "ubo81"
+    estimator: str = "surface"
+    spp: int = 16
+    size: int = 112
+    grid: int = 2
+    truth_spp: int = 48
+    environment_spp: int = 64
+    held_out_texels: int = 32
+    chi2_samples: int = 1_000_000
+    seed: int = 0
+
+    def to_dict(self):
+        """JSON-able form."""
+        return asdict(self)
+
+
+FULL = Settings()
+QUICK = replace(
+    FULL, texels=32, size=72, truth_spp=32, environment_spp=32, held_out_texels=16, chi2_samples=200_000
+)
+
+
+def select(*, only=None, scenes=None, lights=None, mesostructures=None, quick=False):
+    """The cells of a run.
+
+    Parameters
+    ----------
+    only : sequence of str, optional
+        Methods; all registered ones by default, those of installed packages included.
+    scenes, lights, mesostructures : sequence of str, optional
+        Scenes may be files as well. Without any choice of scene or light the quick run shows three views a method.
+    quick : bool
+
+    Returns
+    -------
+    list of Spec
+        Sorted by mesostructure and method.
+
+    Raises
+    ------
+    InputError
+        For a name that is on no axis.
+    """
+    from btfref.mesostructure import names
+
+    _known("method", only, methods())
+    _known("lights", lights, LIGHTS)
+    _known("mesostructure", mesostructures, names())
+    for scene in scenes or ():
+        scene_file(scene)
+    keys = only or list(methods())
+    materials = mesostructures or (MESOSTRUCTURES[:1] if quick else MESOSTRUCTURES)
+    if quick and not scenes and not lights:
+        views = list(QUICK_VIEWS)
+    else:
+        views = [(str(s), light) for s in scenes or SCENES for light in lights or LIGHTS]
+    return sorted(Spec(m, key, scene, light) for m in materials for key in keys for scene, light in views)
+
+
+def _known(what, given, known):
+    for name in given or ():
+        if name not in known:
+            raise InputError(f"unknown {what}", got=repr(name), expected=f"one of {', '.join(known)}")

@@ -1,0 +1,102 @@
+"""Pictures of the matrix that do not depend on the method: the truth, the sampled BTF, pixel classes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from btfref.scenes import scene_file
+from btfref.validate.cache import code_of, key_of
+from btfref.validate.material import fit_key, load_material, make_fit, make_material, material_key
+
+#: Fit whose file stands for the material where only its origin counts: the smallest one.
+CARRIER = {"method": "svd", "parameters": {"components": 1}}
+
+#: Seed of the truth; not that of the synthesis or its twin, whose noise must be independent.
+TRUTH_SEED = 77
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """What all methods' cells of one scene, its lights and one mesostructure share.
+
+    Parameters
+    ----------
+    truth : ndarray of float32, shape (batches, H, W, 3)
+        The mesostructure under every hit.
+    sampled, twin : ndarray of float32, shape (H, W, 3)
+        The sampled BTF by interpolation in float64, and one of other random numbers.
+    classes : ndarray of uint8, shape (H, W)
+    """
+
+    truth: np.ndarray
+    sampled: np.ndarray
+    twin: np.ndarray
+    classes: np.ndarray
+
+
+def views_key(mesostructure, scene, lights, settings):
+    """Key of a `Views`."""
+    named = ("size", "grid", "truth_spp")
+    return key_of(
+        {
+            "views": material_key(mesostructure, settings),
+            "scene": scene_file(scene).read_text("utf-8"),
+            "lights": lights,
+            **{name: getattr(settings, name) for name in named},
+            "carrier": CARRIER,
+            "code": code_of("picture", CARRIER["method"]),
+        }
+    )
+
+
+def make_views(cache, mesostructure, scene, lights, settings):
+    """Compute, or read, the `Views` of a scene.
+
+    Returns
+    -------
+    Views
+    """
+    key = views_key(mesostructure, scene, lights, settings)
+    if not cache.has(key, ".views.npz"):
+        made = _views(cache, mesostructure, scene, lights, settings)
+        cache.write(key, ".views.npz", lambda path: np.savez(path, **vars(made)))
+    with np.load(cache.path(key, ".views.npz")) as stored:
+        return Views(**{name: stored[name] for name in stored.files})
+
+
+def _views(cache, mesostructure, scene, lights, settings):
+    from btfref.registry import method
+    from btfref.render.classes import pixel_classes
+    from btfref.render.definition import render_definition
+    from btfref.render.exact import render_exact
+
+    stores = make_material(cache, mesostructure, settings)
+    carrier = make_carrier(cache, mesostructure, settings)
+    path, size = scene_file(scene), (settings.size, settings.size)
+    parameters = {"btf": str(carrier), "lights": lights}
+    shared = {"parameters": parameters, "grid": settings.grid, "size": size}
+    truth = render_exact(path, spp=settings.truth_spp, seed=TRUTH_SEED, **shared)
+    tables = {name: method("raw").fit(load_material(store)) for name, store in zip("ab", stores, strict=True)}
+    seen = render_definition(path, representations=tables, **shared)
+    classes = pixel_classes(path, **shared)
+    return Views(truth.meta["batches"], seen["a"].image, seen["b"].image, classes)
+
+
+def make_carrier(cache, mesostructure, settings):
+    """A small file that says what the material is of."""
+    from btfref.registry import method
+    from btfref.representations import save
+
+    key = fit_key(mesostructure, CARRIER["method"], settings)
+    if cache.has(key, ".carrier.exr"):
+        return cache.path(key, ".carrier.exr")
+    btf = load_material(make_material(cache, mesostructure, settings)[0])
+    made = method(CARRIER["method"]).fit(btf, **CARRIER["parameters"])
+    return cache.write(key, ".carrier.exr", lambda path: save(made, path))
+
+
+def fitted(cache, spec, settings):
+    """The file of a cell's method."""
+    return make_fit(cache, spec.mesostructure, spec.method, settings)

@@ -1,0 +1,71 @@
+"""The matrix in one table: a row a method and mesostructure."""
+
+from __future__ import annotations
+
+import numpy as np
+
+HEADER = [
+    "mesostructure",
+    "method",
+    "cells",
+    "bytes",
+    "sampled BTF",
+    "fit",
+    "port",
+    "real time",
+    "8 bits",
+    "total",
+    "ΔE00",
+    "held out",
+]
+
+#: Columns of stages in the table, by the names of the stages.
+STAGES = HEADER[4:9]
+
+
+def rows(result):
+    """Summary of a `Validation`.
+
+    Returns
+    -------
+    list of list
+        Columns as in `HEADER`: cells passed of all; bytes of the maps; RMSE of each stage alone and of the whole, root
+        of the mean square over the cells of RMSE over the truth's mean; mean ΔE00 of the whole; mean absolute error at
+        held-out directions over the mean.
+    """
+    table = []
+    for facts in result.methods:
+        mine = (facts["mesostructure"], facts["method"])
+        cells = [c for c in result.cells if (c.facts["mesostructure"], c.facts["method"]) == mine]
+        passed = sum(cell.outcome == "pass" for cell in cells)
+        falls = [cell.facts["waterfall"] for cell in cells if cell.facts["waterfall"]]
+        held_out = (facts.get("held_out") or {}).get("held_out", {}).get("mae")
+        whole = [_relative(fall["total"]["estimate"], fall) for fall in falls]
+        colour = [fall["stages"][-1]["delta_e00_so_far"]["estimate"] for fall in falls]
+        table.append(
+            [
+                *mine,
+                f"{passed}/{len(cells)}",
+                facts.get("bytes"),
+                *(_root(_stage(fall, name) for fall in falls) for name in STAGES),
+                _root(whole),
+                float(np.mean(colour)) if colour else None,
+                held_out,
+            ]
+        )
+    return table
+
+
+def _stage(fall, name):
+    found = [s["rmse"]["estimate"] for s in fall["stages"] if s["name"] == name]
+    return _relative(found[0], fall) if found else None
+
+
+def _relative(value, fall):
+    return value / fall["mean"] if fall["mean"] else None
+
+
+def _root(values):
+    """Root of the mean square of those that are there; None for none."""
+    there = [v for v in values if v is not None]
+    return float(np.sqrt(np.mean(np.square(there)))) if there else None

@@ -1,0 +1,100 @@
+"""Pictures at both ends of the waterfall: the float64 definition, and the mesostructure under every hit."""
+
+import numpy as np
+import pytest
+
+from btfref.compare import compare
+from btfref.registry import methods
+from btfref.render import hits
+from btfref.render.classes import pixel_classes
+from btfref.render.definition import render_definition
+from btfref.render.exact import render_exact
+from btfref.render.geometry import geometry_classes, render_geometry
+from btfref.render.reference import loaded, render
+from btfref.representations import save
+from btfref.sampling.synthesis import synthesize
+from btfref.scenes import scene_file
+
+SIZE = (40, 40)
+
+
+@pytest.fixture(autouse=True)
+def _renderer(need):
+    need("llvm")
+
+
+#: In the default run: a method without levels of detail, and the one that has them; `btfref validate` shows all.
+QUICK = ("lpca", "laplacian")
+
+
+@pytest.mark.parametrize(
+    "key", [pytest.param(key, marks=[] if key in QUICK else pytest.mark.long) for key in methods()]
+)
+def test_the_reference_is_the_definition_in_float32(fits, key):
+    """Curved, both sides seen, transformed texture, point lights: only rounding is between them."""
+    scene, parameters = scene_file("cloth"), {"btf": str(fits.path(key)), "lights": "points2"}
+    shared = {"parameters": parameters, "grid": 2, "size": SIZE}
+    expected = render_definition(scene, **shared)
+    image = render(scene, parameters=parameters, noise_free=2, shadows=False, size=SIZE)
+    comparison = compare(
+        image, expected, classes=pixel_classes(scene, **shared), gate="image.float64", flip=False
+    )
+    assert comparison.passed, [gate.line for gate in comparison.gates if not gate.passed]
+    assert expected.image.max() > 0.05
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """``made(name)``: path of a small representation of a mesostructure."""
+    folder = tmp_path_factory.mktemp("made")
+
+    def get(name):
+        path = folder / f"{name}.svd.exr"
+        if not path.exists():
+            btf = synthesize(name, texels=8, views="10x5", lights="10x5", spp=2)
+            save(methods()["svd"].fit(btf, components=1), path)
+        return str(path)
+
+    return get
+
+
+def test_a_flat_mesostructure_is_known(need, made):
+    """Every path ends at a Lambertian plane: power · ρ/π · cos θ without noise."""
+    scene, parameters = scene_file("sphere"), {"btf": made("flat"), "lights": "directional3"}
+    found = render_exact(scene, parameters=parameters, spp=1, grid=1, size=SIZE)
+    classes = pixel_classes(scene, parameters=parameters, grid=2, size=SIZE)
+    description, material = hits.single_material(scene, parameters, size=SIZE)
+    with loaded(scene, parameters, size=SIZE) as loaded_scene:
+        middle = hits.as_arrays(*hits.intersect(loaded_scene, material, (0.5, 0.5)))
+    radiance = (middle.power * np.maximum(middle.w_light[..., 2:], 0)).sum(0)
+    expected = np.zeros((SIZE[0] * SIZE[1], 3))
+    expected[middle.pixel] = radiance
+    inside = (classes == 1).ravel() & (expected > 0).all(-1)
+    ratio = found.image.reshape(-1, 3)[inside] / expected[inside]
+    # One jittered sample a batch, where the other picture has the middle of the pixel: shading differs by a little.
+    albedo = np.median(ratio) * np.pi
+    assert 0.05 < albedo <= 1
+    assert np.abs(ratio.mean(0) / np.median(ratio, 0) - 1).max() < 0.02
+    assert description.camera.width == SIZE[0]
+
+
+def test_on_a_plane_it_is_the_path_traced_geometry(made):
+    """Two programs for one truth: borders apart, nothing but noise is between them."""
+    scene, parameters = scene_file("plane"), {"btf": made("checker"), "lights": "directional1"}
+    shared = {"parameters": parameters, "size": SIZE}
+    mine = render_exact(scene, spp=32, seed=3, **shared)
+    theirs = render_geometry(scene, spp=128, seed=4, **shared)
+    classes = geometry_classes(scene, **shared)
+    comparison = compare(mine, theirs, classes=classes, flip=False)
+    bias = comparison.statistics["interior"]["bias"]
+    assert bias["low"] <= 0 <= bias["high"]
+    error = comparison.statistics["interior"]["rmse_without_noise"]
+    assert error["low"] < 0.05 * comparison.metrics["interior"]["mean_reference"]
+    assert (classes == 1).mean() > 0.1
+
+
+def test_same_seed_same_picture(made):
+    shared = {"parameters": {"btf": made("checker")}, "size": (12, 12), "spp": 4}
+    first, again, other = (render_exact(scene_file("plane"), seed=s, **shared).image for s in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
