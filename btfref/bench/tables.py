@@ -8,6 +8,9 @@ import statistics
 from btfref.bench.metrics import latest, read_records, rows
 from btfref.report.pareto import Panel, Point, front
 
+#: Relative errors up to this are the rounding of float32 answers.
+REPEATED = 1e-6
+
 #: Kinds of records in the order of tables: title and columns.
 KINDS = {
     "build": "Fits",
@@ -57,10 +60,11 @@ def panels(found, material):
     Returns
     -------
     list of btfref.report.pareto.Panel
-        Those for which there is anything; entries without error, which repeat the data, are left out.
+        Those for which there is anything; entries that repeat the data are left out. Names are short: what a method
+        was built with by its numbers alone.
     """
     own = [r for r in found if r["material"] == material]
-    error = {r["entry"]: r for r in own if r["kind"] == "error" and r["rmse"] > 0}
+    error = {r["entry"]: r for r in own if r["kind"] == "error" and r["rmse"] > REPEATED}
     group = {name: name.split(" (")[0] for name in error}
     costs = {
         "bytes of the maps": {r["entry"]: r["payload"] for r in own if r["kind"] == "build"},
@@ -75,13 +79,20 @@ def panels(found, material):
     result = []
     for label, cost in costs.items():
         points = [
-            Point(name, cost[name], e["rmse"], group[name], e["rmse_low"] or None, e["rmse_high"])
+            Point(_short(name), cost[name], e["rmse"], group[name], e["rmse_low"] or None, e["rmse_high"])
             for name, e in error.items()
             if name in cost
         ]
         if points:
             result.append(Panel(material, label, "RMSE / RMS of the BTF", points))
     return result
+
+
+def _short(name):
+    method, _, described = name.partition(" (")
+    return " ".join(
+        [method, "×".join(word.split(" ")[-1] for word in described.rstrip(")").split(", "))]
+    ).strip()
 
 
 def summary(folder):

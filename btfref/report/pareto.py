@@ -12,9 +12,10 @@ import numpy as np
 
 from btfref.errors import InputError
 
-#: Colours (Okabe and Ito 2008: told apart by the colour-blind) and markers of groups, in their order.
+#: Colours (Okabe and Ito 2008: told apart by the colour-blind) and markers of groups, in their order; as their numbers
+#: differ by one, 56 groups look different.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#000000", "#e69f00", "#56b4e9")
-MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 #: Opacity of dominated points and their names.
 DIM = 0.35
@@ -113,7 +114,7 @@ def pareto_table(panel):
 
 
 def draw_pareto(panels, path):
-    """Write panels side by side as one picture.
+    """Write panels as one picture: up to three side by side, more of them in rows of two.
 
     Parameters
     ----------
@@ -153,13 +154,23 @@ def _figure(panels):
     from matplotlib.figure import Figure
 
     groups = list(dict.fromkeys(p.group for panel in panels for p in panel.points))
-    figure = Figure(figsize=(5.2 * len(panels), 4.2), layout="constrained")
-    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    columns = len(panels) if len(panels) <= 3 else 2
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(5.2 * columns, 4.2 * rows), layout="constrained")
+    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for axis in axes[len(panels) :]:
+        axis.remove()
+    axes = axes[: len(panels)]
     pending = [_draw(axis, panel, groups) for axis, panel in zip(axes, panels, strict=True)]
     if len(groups) > 1:
         handles, names = axes[0].get_legend_handles_labels()
         figure.legend(
-            handles, names, loc="outside lower center", ncols=len(groups), fontsize=8, frameon=False
+            handles,
+            names,
+            loc="outside lower center",
+            ncols=min(len(groups), 4 * columns),
+            fontsize=8,
+            frameon=False,
         )
     # Names are placed last, when limits and layout are known.
     figure.draw_without_rendering()
