@@ -15,7 +15,7 @@ import numpy as np
 
 from btfref.bench import scenes
 from btfref.bench.evaluators import EVALUATORS, evaluation, random_points
-from btfref.bench.timing import interleaved
+from btfref.bench.timing import interleaved, kernels
 
 
 def timed_builds(makes, rounds, report=lambda name: None):
@@ -96,11 +96,11 @@ def measure_eval(built, path, plan, entry, rng):
         reference = None
         for kind in known:
             with evaluation(kind, built, path, points[kind], query) as (run, values):
-                start = time.perf_counter()
-                run()
-                cold = time.perf_counter() - start
+                cold, facts = _cold(run, kind == "drjit")
                 times = interleaved({kind: run}, plan.rounds["eval"])[kind]
                 found = values()
+                if facts:
+                    facts["kernels"]["warm_execution_s"] = kernels(run)["execution_s"]
             if reference is None:
                 reference = found
                 some = points[kind]
@@ -117,6 +117,7 @@ def measure_eval(built, path, plan, entry, rng):
                 "points": len(points[kind][0]),
                 "cold_s": cold,
                 "warm_s": times,
+                **facts,
                 "largest_difference": difference,
             }
 
@@ -148,14 +149,12 @@ def measure_render(subjects, btf, plan):
         for name, (_, _, bsdf) in materials.items():
             loaded = mi.load_dict(scenes.scene(scene, bsdf, size=plan.settings["render_size"]))
             render = scenes.render_task(loaded, plan.settings["render_spp"])
-            start = time.perf_counter()
-            first = np.array(render())
-            cold[name] = time.perf_counter() - start
-            pictures[name] = [first]
+            pictures[name] = []
             tasks[name] = _keeping(render, pictures[name])
+            cold[name] = _cold(tasks[name], True)
         times = interleaved(tasks, plan.rounds["render"])
         for name, (entry, query, _) in materials.items():
-            one, other = (np.asarray(p) for p in pictures[name][:2])
+            one, other = pictures[name]
             yield (
                 entry,
                 {
@@ -163,8 +162,9 @@ def measure_render(subjects, btf, plan):
                     "query": query,
                     "scene": scene,
                     "spp": plan.settings["render_spp"],
-                    "cold_s": cold[name],
+                    "cold_s": cold[name][0],
                     "warm_s": times[name],
+                    **cold[name][1],
                     "variance": float(((one - other) ** 2).mean() / 2),
                     "mean": float(one.mean()),
                 },
@@ -240,6 +240,18 @@ def saved(built, entry, folder):
     handle.close()
     save(built.representation, handle.name)
     return Path(handle.name)
+
+
+def _cold(task, jit):
+    """Seconds of the first call, and what its kernels took where there are any."""
+    facts = []
+    start = time.perf_counter()
+    if jit:
+        facts.append(kernels(task))
+    else:
+        task()
+    seconds = time.perf_counter() - start
+    return seconds, {"kernels": facts[0]} if facts else {}
 
 
 def _keeping(render, pictures):

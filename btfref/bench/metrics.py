@@ -176,10 +176,10 @@ def rows(folder, records=None):
         elif kind == "eval":
             row |= {"evaluator": r["evaluator"], "cold_s": r["cold_s"], "time": time_of(r)}
             row["per_second"] = r["points"] / row["time"]["median"]
-            row["largest_difference"] = r["largest_difference"]
+            row |= {"largest_difference": r["largest_difference"], "kernels": r.get("kernels")}
         elif kind == "render":
             base = plain[r["run"], r["material"], r["scene"]]
-            row |= {"scene": r["scene"], "cold_s": r["cold_s"], "time": time_of(r)}
+            row |= {"scene": r["scene"], "cold_s": r["cold_s"], "time": time_of(r), "kernels": r["kernels"]}
             row["ratio"] = paired_ratio(r, base)
             # The noise of a picture that is given one second: variance falls with samples, samples grow with time.
             row["noise_at_1s"] = float(np.sqrt(r["variance"] * row["time"]["median"]) / r["mean"])

@@ -190,6 +190,14 @@ def _bytes(n):
     return "–" if n is None else f"{n:,}".replace(",", " ")
 
 
+def _new_kernels(facts):
+    """How many kernels the first call had to compile or load, and what that took."""
+    if facts is None:
+        return "–"
+    found = facts["compiled"], facts["from_disk"]
+    return f"{found[0]} compiled, {found[1]} from disk: {facts['codegen_s'] + facts['backend_s']:.2g} s"
+
+
 _NAME = {
     "material": lambda r: r["material"],
     "entry": lambda r: r["entry"],
@@ -218,6 +226,7 @@ _COLUMNS = {
         "million a second": lambda r: f"{1e-6 * r['per_second']:.3g}",
         "seconds": lambda r: _span(r["time"]),
         "cold": lambda r: f"{r['cold_s']:.3g}",
+        "kernels, new": lambda r: _new_kernels(r["kernels"]),
         "difference": lambda r: f"{r['largest_difference']:.1e}",
     },
     "render": {
@@ -226,6 +235,7 @@ _COLUMNS = {
         "entry": lambda r: " ".join([r["entry"], r["query"]]).strip(),
         "seconds": lambda r: _span(r["time"]),
         "cold": lambda r: f"{r['cold_s']:.3g}",
+        "kernels, new": lambda r: _new_kernels(r["kernels"]),
         "ratio": lambda r: _span(r["ratio"]),
         "noise after 1 s": lambda r: f"{100 * r['noise_at_1s']:.2f} %",
     },

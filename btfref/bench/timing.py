@@ -66,3 +66,34 @@ def summary(times, baseline):
             "ratio_max": max(ratios),
         }
     return result
+
+
+def kernels(task):
+    """Run a task of Dr.Jit and tell what its kernels took, tracing and Python left out.
+
+    Parameters
+    ----------
+    task : callable
+        Waits for its results.
+
+    Returns
+    -------
+    dict
+        ``launched``, ``compiled`` (neither in memory nor on disk), ``from_disk``: numbers of kernels; ``codegen_s``,
+        ``backend_s`` (LLVM or PTX, or loading from disk), ``execution_s``.
+    """
+    import drjit as dr
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        task()
+        entries = [e for e in dr.kernel_history() if e["type"] == dr.KernelType.JIT]
+    new = [e for e in entries if not e["cache_hit"]]
+    return {
+        "launched": len(entries),
+        "compiled": sum(not e["cache_disk"] for e in new),
+        "from_disk": sum(bool(e["cache_disk"]) for e in new),
+        "codegen_s": 1e-3 * sum(e["codegen_time"] for e in new),
+        "backend_s": 1e-3 * sum(e["backend_time"] for e in new),
+        "execution_s": 1e-3 * sum(e["execution_time"] for e in entries),
+    }

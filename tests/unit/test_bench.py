@@ -194,6 +194,13 @@ def test_evaluators_agree_and_times_are_positive(found):
             assert row["cold_s"] > 0
 
 
+def test_kernels_are_told_apart_from_the_rest(found):
+    for row in [r for r in found if r["kind"] == "render" or r.get("evaluator") == "drjit"]:
+        facts = row["kernels"]
+        assert facts["launched"] >= max(1, facts["compiled"] + facts["from_disk"])
+        assert 0 < facts["execution_s"] <= row["cold_s"] * 2.01
+
+
 def test_ratios_are_of_pairs(results, found):
     records = [r for r in metrics.read_records(results) if r["record"] == "build"]
     by_name = {r["entry"]: r["warm_s"] for r in records}
