@@ -26,7 +26,7 @@ from btfref.scenes import scene_file
 def add_arguments(parser):
     """Describe the command's arguments."""
     parser.add_argument(
-        "scene", metavar="SCENE", help="scene file, or plane, sphere, cloth, horizon, turning"
+        "scene", metavar="SCENE", help="scene file, or plane, sphere, cloth, bowl, horizon, turning"
     )
     parser.add_argument("-o", "--output", required=True, metavar="X.exr", help="the image to write")
     parser.add_argument(
@@ -81,7 +81,8 @@ def run(args):
     else:
         meta = result.meta
         emit(f"{out}: {meta['frame_ms']:.3g} ms a frame on {meta['gl_renderer']}")
-        if "environment_lights" in meta:
-            error = f"estimated error {100 * meta['estimated_error']:.2g} %"
-            emit(f"environment: {meta['environment_lights']} lights, {error}")
+        if "estimated_error" in meta:
+            count = meta.get("environment_lights", meta.get("order"))
+            kind = "lights" if "environment_lights" in meta else "bands"
+            emit(f"environment: {count} {kind}, estimated error {100 * meta['estimated_error']:.2g} %")
     return 0

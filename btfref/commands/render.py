@@ -1,6 +1,6 @@
 """Render a Mitsuba scene: the reference image.
 
-SCENE is a Mitsuba XML file, or one of the scenes that btfref ships: plane, sphere, cloth, horizon, turning.
+SCENE is a Mitsuba XML file, or one of the scenes that btfref ships: plane, sphere, cloth, bowl, horizon, turning.
 Any integrator; the film becomes float32 with a box filter. Where all lights are directional or points,
 --noise-free N evaluates the material on a regular N × N grid in each pixel, without random numbers.
 --geometry shows the truth beyond every representation: the flat shape replaced by the mesostructure itself,
@@ -17,7 +17,7 @@ from btfref.scenes import scene_file
 def add_arguments(parser):
     """Describe the command's arguments."""
     parser.add_argument(
-        "scene", metavar="SCENE", help="scene file, or plane, sphere, cloth, horizon, turning"
+        "scene", metavar="SCENE", help="scene file, or plane, sphere, cloth, bowl, horizon, turning"
     )
     parser.add_argument("-o", "--output", required=True, metavar="X.exr", help="the image to write")
     parser.add_argument(
@@ -29,7 +29,7 @@ def add_arguments(parser):
     parser.add_argument(
         "--noise-free", type=count(1), metavar="N", help="regular N × N grid per pixel, delta lights"
     )
-    parser.add_argument("--no-shadows", action="store_true", help="with --noise-free: no cast shadows")
+    parser.add_argument("--no-shadows", action="store_true", help="direct light without cast shadows")
     parser.add_argument("--size", type=size, metavar="WxH", help="of the film, in pixels")
     parser.add_argument("--geometry", action="store_true", help="path trace the mesostructure itself")
     parser.add_argument("--classes", metavar="C.png", help="also write the pixel classes (for compare)")
@@ -40,10 +40,6 @@ def run(args):
     """Carry the command out."""
     scene, out = scene_file(args.scene), output_file(args.output, ".exr")
     parameters = assignments(args.define, convert=str, option="-D")
-    if args.no_shadows and args.noise_free is None:
-        raise InputError(
-            "only the noise-free mode can leave shadows out", field="--no-shadows", expected="--noise-free N"
-        )
     if args.geometry and args.noise_free is not None:
         raise InputError("geometry is path traced", field="--geometry", got="--noise-free")
     classes_out = output_file(args.classes, ".png") if args.classes else None

@@ -351,7 +351,7 @@ def _measure(entry, name, table, comparison, mask):
         return metrics.percentiles(error)[entry]
     if entry == "lost_negative":
         return metrics.lost_negative(t, r)
-    if entry in ("rejected_fraction", "relative_rmse"):
+    if entry in ("rejected_fraction", "relative_rmse", "relative_tile_bias"):
         if comparison.variance is None:
             return Measured(None, "fail", "needs the variance of the reference, none was given")
         known = np.isfinite(comparison.variance[mask]).all(-1)
@@ -361,6 +361,8 @@ def _measure(entry, name, table, comparison, mask):
         if entry == "rejected_fraction":
             p = significance.welch_test(t, v, r, 0.0)[1]
             return significance.difference_test(p, significance=table["significance"]).rejected_fraction
+        if entry == "relative_tile_bias":
+            return _tiles(comparison, mask, table)
         return _equivalence(t, r, v, table)
     if entry in comparison.metrics[name]:
         return comparison.metrics[name][entry]
@@ -385,3 +387,26 @@ def _equivalence(t, r, variance, table):
         result.outcome,
         f"{100 * mse.confidence:g} % interval {relative.low:.2e} to {relative.high:.2e}",
     )
+
+
+def _tiles(comparison, mask, table):
+    scale = float(np.mean(np.abs(comparison.reference[mask])))
+    if scale == 0:
+        return Measured(None, "fail", "the reference is black: no relative error")
+    # What is not looked at may not be finite.
+    difference, variance = (
+        np.where(mask[..., None], image, 0.0)
+        for image in (comparison.test - comparison.reference, comparison.variance)
+    )
+    found = significance.tile_equivalence(
+        difference / scale,
+        variance / scale**2,
+        mask,
+        tolerance=table["relative_tile_bias"],
+        significance=table["significance"],
+    )
+    if found is None:
+        return Measured(None, "empty", "no tile of which a quarter is of the class")
+    worst = found.interval
+    detail = f"interval of the worst tile {worst.low:.2e} to {worst.high:.2e}"
+    return Measured(abs(worst.estimate), found.outcome, detail)

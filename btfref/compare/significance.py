@@ -303,7 +303,7 @@ def equivalence_test(measured, *, tolerance):
     return Equivalence(outcome, measured, float(tolerance))
 
 
-def tile_means(image, variance, mask, *, size=8):
+def tile_means(image, variance, mask, *, size=8, least=1):
     """Means and variances of the mean over square tiles: less noise, and a bias of a region shows.
 
     Parameters
@@ -314,11 +314,13 @@ def tile_means(image, variance, mask, *, size=8):
         Pixels that count.
     size : int, optional
         Edge of a tile in pixels; tiles at the right and lower border may be smaller.
+    least : int, optional
+        Counted pixels that a tile needs.
 
     Returns
     -------
     means, variances : (n, C) float64 arrays
-        Tiles without a counted pixel are left out.
+        Tiles with fewer counted pixels than ``least`` are left out.
     """
     x, v = paired(image, variance)
     height, width, channels = x.shape
@@ -326,13 +328,50 @@ def tile_means(image, variance, mask, *, size=8):
     label = (np.arange(height)[:, None] // size) * across + np.arange(width) // size
     label, n = label[mask], -(-height // size) * across
     count = np.bincount(label, minlength=n)
-    used = count > 0
+    used = count >= least
 
     def total(values):
         return np.stack([np.bincount(label, values[mask][:, c], n) for c in range(channels)], -1)[used]
 
     count = count[used, None]
     return total(x) / count, total(v) / count**2
+
+
+def tile_equivalence(difference, variance, mask, *, tolerance, significance=0.01, size=8):
+    """Whether the mean difference of every tile is surely within ± tolerance.
+
+    Parameters
+    ----------
+    difference, variance : (H, W, C) array
+        Test - reference and its variance.
+    mask : (H, W) bool array
+        Pixels that count.
+    tolerance : float
+        Positive.
+    significance : float
+        Of all tiles and channels together (Šidák-corrected).
+    size : int
+        Edge of a tile in pixels.
+
+    Returns
+    -------
+    Equivalence or None
+        Of the tile with the largest mean difference; "pass" when all intervals lie inside, "fail" when one lies wholly
+        outside. None without a tile of which a quarter counts.
+    """
+    mean, spread = tile_means(difference, variance, mask, size=size, least=size * size // 4)
+    if not mean.size:
+        return None
+    confidence = 1 - sidak(significance, mean.size)
+    # A normal interval's half width is the same multiple of the standard error for all.
+    half = interval(0.0, 1.0, confidence=confidence).high * np.sqrt(spread)
+    if (np.abs(mean) - half > tolerance).any():
+        outcome = "fail"
+    else:
+        outcome = "pass" if (np.abs(mean) + half < tolerance).all() else "inconclusive"
+    worst = np.unravel_index(np.abs(mean).argmax(), mean.shape)
+    worst = interval(mean[worst], np.sqrt(spread[worst]), confidence=confidence)
+    return Equivalence(outcome, worst, float(tolerance))
 
 
 def _with_variance(difference, variance):

@@ -14,6 +14,7 @@ from btfref import conventions
 from btfref.errors import InputError
 from btfref.numerics import harmonics, interpolation
 from btfref.numerics.quadrature import gauss_hemisphere
+from btfref.render import light_set
 
 #: Bands of the paper.
 ORDER = 5
@@ -23,6 +24,9 @@ NODES = 128, 720
 
 #: Cells that stand for a picture when it is projected: 0.7 degrees each.
 CELL_ROWS = 256
+
+#: Order of the rule that integrates what receivers see of the harmonics.
+ESTIMATE = 48
 
 #: Points evaluated at a time in float64.
 CHUNK = 1 << 11
@@ -71,6 +75,27 @@ def environment_coefficients(environment, order, *, window=None):
         part = lit[first : first + (1 << 14)]
         total += harmonics.values(w[part], order).T @ power[part]
     return harmonics.window(window, order)[:, None] * total
+
+
+def estimated_error(environment, coefficients):
+    """How differently receivers see an environment and its harmonics: see :mod:`btfref.render.light_set`.
+
+    Parameters
+    ----------
+    environment : btfref.render.environment.Environment
+    coefficients : ndarray, shape (order², 3)
+        World space.
+
+    Returns
+    -------
+    float
+        Relative RMSE of luminance.
+    """
+    w, power = environment.cells()
+    node, weight = harmonics.sphere_rule(ESTIMATE)
+    order = int(np.sqrt(len(coefficients)))
+    seen = weight[:, None] * (harmonics.values(node, order) @ coefficients)
+    return light_set.estimated_error(node, seen, w, power)
 
 
 def light_projection(representation, order):

@@ -169,6 +169,7 @@ class Lighting:
             "order": order,
             "window": self._window or "none",
             "ringing": harmonics.ringing(light, order),
+            "estimated_error": harmonic_light.estimated_error(self.environment, light),
         }
         shader = representation.harmonic_shader
         return Prepared("sh", shader, tables, radiance, facts, {"HARMONIC_ORDER": order})

@@ -29,6 +29,7 @@ def render(
     shadows=True,
     size=None,
     with_variance=False,
+    grid=None,
 ):
     """Render a scene with Mitsuba.
 
@@ -49,11 +50,14 @@ def render(
         light: nothing is random. Needs delta lights and a JIT variant; replaces integrator, sampler, spp and
         seed.
     shadows : bool
-        False leaves cast shadows out (``noise_free`` only).
+        False leaves cast shadows out: direct light of delta lights and an environment, whatever the scene's integrator.
     size : (int, int), optional
         Width and height in place of the scene's.
     with_variance : bool
         Estimate the variance of the mean from independent renders of ``spp / 16`` samples each.
+    grid : int, optional
+        Direct light only, at n × n regular sub-pixel positions as ``noise_free``, but with random directions of the
+        light, so that environments are possible; always with a variance.
 
     Returns
     -------
@@ -66,19 +70,24 @@ def render(
     MissingDependencyError
         Without a usable LLVM for an llvm variant.
     """
-    if noise_free is None and not shadows:
-        raise InputError("only the noise-free mode leaves shadows out", field="shadows", got=False)
-    for name, value in (("spp", spp), ("noise_free", noise_free)):
+    for name, value in (("spp", spp), ("noise_free", noise_free), ("grid", grid)):
         if value is not None and value < 1:
             raise InputError("at least one sample is needed", field=name, got=value, expected="≥ 1")
     with loaded(scene, parameters, variant=variant, size=size) as made:
-        tell_camera(made, 1 / noise_free if noise_free else (spp or _sample_count(made)) ** -0.5)
+        tell_camera(
+            made, 1 / (noise_free or grid) if noise_free or grid else (spp or _sample_count(made)) ** -0.5
+        )
         start = time.perf_counter()
         if noise_free is not None:
             image, variance = _noise_free(made, noise_free, shadows), None
             settings = {"noise_free": noise_free, "shadows": shadows, "integrator": "noise-free direct"}
+        elif grid is not None:
+            from btfref.render.direct_light import regular
+
+            image, variance, spp = regular(made, grid, spp or _sample_count(made), seed, shadows)
+            settings = {"grid": grid, "spp": spp, "seed": seed, "shadows": shadows, "integrator": "direct"}
         else:
-            image, variance, settings = _monte_carlo(made, spp, seed, with_variance)
+            image, variance, settings = _monte_carlo(made, spp, seed, with_variance, shadows)
         seconds = time.perf_counter() - start
     facts = {"renderer": "mitsuba", "variant": variant, "rfilter": "box", "component_format": "float32"}
     return RenderResult(image, variance, {**facts, **settings, "seconds": seconds, **_versions()})
@@ -166,20 +175,23 @@ def _plain_film(parsed, index):
         parsed.nodes.append(node)
 
 
-def _monte_carlo(scene, spp, seed, with_variance):
+def _monte_carlo(scene, spp, seed, with_variance, shadows):
     import mitsuba as mi
 
+    from btfref.render.direct_light import make_integrator
+
     spp = spp or _sample_count(scene)
-    integrator = scene.integrator()
+    integrator = scene.integrator() if shadows else make_integrator(shadows=False)
     if integrator is None:
         raise InputError("the scene has no integrator", field="integrator", expected="such as path")
     settings = {
         "seed": seed,
         "integrator": integrator.class_name() if hasattr(integrator, "class_name") else "",
+        "shadows": shadows,
     }
 
     def once(count, number):
-        return np.array(mi.render(scene, spp=count, seed=number), np.float32)[..., :3]
+        return np.array(mi.render(scene, integrator=integrator, spp=count, seed=number), np.float32)[..., :3]
 
     if not with_variance:
         return once(spp, seed), None, {**settings, "spp": spp}

@@ -36,8 +36,20 @@ def cloth(u, v):
     return np.stack([x, y, height + 0.085 * square / (0.35 + square) * folds], -1)
 
 
+def bowl(u, v):
+    """Square bowl, u and v ∈ [0, 1], deep enough that its walls hide much of the sky; (...) -> (..., 3)."""
+    x, y = 2 * u - 1, 2 * v - 1
+    # The square of the radius, flattened towards the corners so that they do not stick out.
+    square = x**2 + y**2
+    return np.stack([x, y, 1.6 * square / (0.6 + 0.4 * square) - 0.9], -1)
+
+
 #: Name: surface, extent of u and v, segments.
-SURFACES = {"sphere": (sphere, (2.0, 1.0), (96, 48)), "cloth": (cloth, (1.0, 1.0), (64, 64))}
+SURFACES = {
+    "sphere": (sphere, (2.0, 1.0), (96, 48)),
+    "cloth": (cloth, (1.0, 1.0), (64, 64)),
+    "bowl": (bowl, (1.0, 1.0), (40, 40)),
+}
 
 
 def surface_mesh(name):
@@ -45,7 +57,7 @@ def surface_mesh(name):
 
     Parameters
     ----------
-    name : {"sphere", "cloth"}
+    name : {"sphere", "cloth", "bowl"}
 
     Returns
     -------

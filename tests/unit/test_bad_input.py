@@ -244,7 +244,7 @@ def test_what_is_no_store(name, folder, capsys):
         (["render", "nonsense", "-o", "out.exr"], ["nonsense", "sphere"]),
         (["render", "good.xml", "-o", "out.jpg"], ["out.jpg"]),
         (["render", "good.xml", "-o", "out.exr", "--variant", "nonsense"], ["nonsense"]),
-        (["render", "good.xml", "-o", "out.exr", "--no-shadows"], ["--noise-free"]),
+        (["realtime", "good.xml", "-o", "out.exr", "--order", "0"], ["--order"]),
         (["render", "good.xml", "-o", "out.exr", "--geometry", "--noise-free", "2"], ["--geometry"]),
         (["render", "good.xml", "-o", "out.exr", "-D", "nonsense=1"], ["nonsense"]),
         (["realtime", "good.xml", "-o", "out.exr", "-D", "nonsense=1"], ["nonsense"]),

@@ -1,0 +1,84 @@
+"""References that are good enough to decide: samples are added until their noise is a share of a gate's tolerance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from btfref.compare.tolerances import tolerance
+from btfref.render.reference import BATCHES, render
+
+#: Samples a pixel of the first round, and most of all rounds.
+FIRST, MOST = 256, 1 << 15
+
+
+def converged(
+    scene,
+    mask,
+    *,
+    gate,
+    parameters=None,
+    size=None,
+    seed=1,
+    shadows=True,
+    grid=None,
+    most=MOST,
+    progress=None,
+):
+    """Path trace until the noise decides nothing.
+
+    Parameters
+    ----------
+    scene : path-like or dict
+    mask : ndarray of bool, shape (H, W)
+        Pixels that the gate looks at.
+    gate : str
+        Key of ``tolerances.toml`` with ``relative_rmse``.
+    parameters : dict of str to str, optional
+    size : (int, int), optional
+    seed : int
+    shadows, grid
+        As of :func:`btfref.render.reference.render`.
+    most : int
+        Samples a pixel at which the search ends, whatever the noise: the gate is then inconclusive at worst.
+    progress : callable, optional
+        ``progress(done, total, label)``.
+
+    Returns
+    -------
+    RenderResult
+        ``meta["noise"]``, the root mean variance over the mask relative to the mean radiance; ``meta["noise_limit"]``,
+        a quarter of the gate's tolerance; ``meta["spp"]``.
+    """
+    limit = tolerance("reference.standard_error.max_fraction") * tolerance(f"{gate}.relative_rmse")
+    seeds = np.random.SeedSequence(seed).generate_state(32)
+    mean = squared = 0.0
+    done, count = 0, FIRST
+    for number in seeds:
+        found = render(
+            scene,
+            parameters=parameters,
+            spp=count,
+            seed=int(number),
+            size=size,
+            shadows=shadows,
+            grid=grid,
+            with_variance=True,
+        )
+        taken = found.meta["spp"]
+        # Rounds are weighted by their samples; so are the variances of their means, twice.
+        mean = (done * mean + taken * found.image.astype(float)) / (done + taken)
+        squared = (done**2 * squared + taken**2 * found.variance.astype(float)) / (done + taken) ** 2
+        done += taken
+        scale = float(np.abs(mean[mask]).mean()) if mask.any() else 0.0
+        noise = float(np.sqrt(squared[mask].mean())) / scale if scale > 0 else 0.0
+        if progress:
+            progress(min(done, most), most, f"reference, noise {noise:.2g} of {limit:.2g}")
+        if noise <= limit or done >= most:
+            break
+        # As many as the noise asks for, a tenth more because it is itself an estimate.
+        wanted = 1.1 * done * (noise / limit) ** 2 - done
+        count = int(np.clip(wanted, BATCHES, max(BATCHES, min(most - done, 8 * done))))
+    meta = {**found.meta, "spp": done, "noise": noise, "noise_limit": limit}
+    return replace(found, image=mean.astype(np.float32), variance=squared.astype(np.float32), meta=meta)

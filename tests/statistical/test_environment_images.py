@@ -1,0 +1,121 @@
+"""Pictures under environments against the path tracer: every method, four environments, three scenes.
+
+The gates are equivalence tests: a noisy reference is inconclusive, never a pass. References have no cast shadows, as
+the pictures, and the same sub-pixel positions, so that what is left is the approximation.
+"""
+
+import numpy as np
+import pytest
+
+from btfref.compare import compare
+from btfref.compare.significance import tile_equivalence
+from btfref.compare.tolerances import tolerance
+from btfref.registry import methods
+from btfref.render.classes import pixel_classes
+from btfref.render.converged import converged
+from btfref.render.direct_light import regular
+from btfref.render.realtime import realtime
+from btfref.render.reference import loaded, render
+from btfref.scenes import scene_file
+
+SCENES = ("plane", "sphere", "cloth")
+ENVIRONMENTS = ("constant", "sky", "studio", "bright-texel")
+GATES = {
+    "lights": ("image.environment_lights",),
+    "prefiltered": ("image.environment", "image.environment_tiles"),
+}
+
+#: In the default run.
+QUICK = {
+    ("lpca", "cloth", "bright-texel"),
+    ("raw", "plane", "constant"),
+    ("cmf", "sphere", "bright-texel"),
+    ("rf_poly", "sphere", "constant"),
+}
+
+
+@pytest.fixture(autouse=True)
+def _renderers(need):
+    need("llvm"), need("gl")
+
+
+def cell(key, scene, environment):
+    """A cell of the matrix, long unless quick."""
+    marks = [] if (key, scene, environment) in QUICK else [pytest.mark.long]
+    return pytest.param(key, scene, environment, marks=marks, id=f"{key}-{scene}-{environment}")
+
+
+CELLS = [cell(k, s, e) for k in methods() for s in SCENES for e in ENVIRONMENTS]
+
+
+def compared(path, scene, environment, gates, *, size=(24, 24), way="auto", **options):
+    """A picture and its converged reference, compared."""
+    parameters = {"btf": str(path), "lights": "envmap", "environment": environment}
+    settings = {"parameters": parameters, "size": size, "grid": 2}
+    file = scene_file(scene)
+    image = realtime(file, environment=way, **options, **settings)
+    classes = pixel_classes(file, **settings)
+    reference = converged(file, classes == 1, gate=gates[0], shadows=False, **settings)
+    assert reference.meta["noise"] <= reference.meta["noise_limit"]
+    return image, compare(image, reference, classes=classes, gate=gates, flip=False)
+
+
+@pytest.mark.parametrize(("key", "scene", "environment"), CELLS)
+def test_every_method_under_every_environment(fits, key, scene, environment):
+    way = "prefiltered" if methods()[key].image_light else "lights"
+    image, found = compared(fits.path(key), scene, environment, GATES[way])
+    assert image.meta["environment_path"] == way
+    assert found.passed, [gate.line for gate in found.gates]
+
+
+def test_spherical_harmonics_say_where_they_fail(fits):
+    """Five bands under a single bright texel: not a pass, and the picture's own facts warn of it."""
+    gates = GATES["lights"]
+    image, found = compared(fits.path("lpca"), "sphere", "bright-texel", gates, way="sh")
+    assert [gate.outcome for gate in found.gates if gate.name.endswith("relative_rmse")] == ["fail"]
+    assert image.meta["ringing"] > 0.1
+    assert image.meta["estimated_error"] > tolerance("image.environment_lights.relative_rmse")
+
+
+def test_the_reference_without_shadows_is_unbiased(fits):
+    """A constant environment in a bowl: exactly the albedo without shadows, and darker with them."""
+    parameters = {"btf": str(fits.path("lpca")), "lights": "constant"}
+    settings = {"parameters": parameters, "size": (24, 24), "grid": 2}
+    file = scene_file("bowl")
+    # Order 1 of spherical harmonics is exact here.
+    exact = realtime(file, environment="sh", order=1, **settings)
+    inside = pixel_classes(file, **settings) == 1
+    plain = render(file, spp=1024, seed=3, shadows=False, **settings)
+    found = compare(
+        exact, plain, classes=inside.astype(np.uint8), gate="image.environment_lights", flip=False
+    )
+    assert found.passed, [gate.line for gate in found.gates]
+    shadowed = render(file, spp=256, seed=3, **settings)
+    assert shadowed.image[inside].mean() < 0.8 * plain.image[inside].mean()
+    # The usual integrator, with random positions, has the same mean.
+    with loaded(file, parameters, size=(24, 24)) as made:
+        image, variance, spp = regular(made, 2, 250, 0, shadows=True)
+    assert spp >= 250
+    z = (image - shadowed.image)[inside] / np.sqrt(variance + shadowed.variance)[inside]
+    assert np.abs(z).mean() < 1.0
+    assert abs(z.mean()) * np.sqrt(z.size) < 5
+
+
+def test_tiles_have_three_outcomes(rng):
+    """A region that is off by more, less, or an unknown amount."""
+    mask = np.ones((32, 40), bool)
+    mask[30:] = False
+    noise = rng.normal(size=(32, 40, 3))
+    wrong = np.zeros_like(noise)
+    wrong[8:16, 16:24] = 0.05
+    settings = {"mask": mask, "tolerance": 0.02}
+
+    def outcome(difference, sigma):
+        variance = np.full(noise.shape, sigma**2)
+        return tile_equivalence(difference + sigma * noise, variance, **settings).outcome
+
+    assert outcome(0 * wrong, 0.01) == "pass"
+    assert outcome(wrong, 0.01) == "fail"
+    assert outcome(0 * wrong, 1.0) == "inconclusive"
+    assert outcome(wrong, 1.0) == "inconclusive"
+    assert tile_equivalence(wrong, wrong, np.zeros_like(mask), tolerance=0.02) is None
