@@ -63,6 +63,20 @@ class Method:
         return import_module(self.fit_module or self.module).fit
 
     @property
+    def fit_partial(self):
+        """``fit_partial(store, **params) -> Representation`` of what is there of a store that was filled in part.
+
+        Raises
+        ------
+        InputError
+            For a method that needs the whole.
+        """
+        found = getattr(import_module(self.module), "fit_partial", None)
+        if found is None:
+            raise InputError("the method needs the whole BTF", field="--partial", got=self.key)
+        return found
+
+    @property
     def presets(self):
         """Named settings of ``fit``; "paper" has the settings of the method's paper."""
         return import_module(self.fit_module or self.module).PRESETS

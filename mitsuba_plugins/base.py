@@ -91,6 +91,7 @@ def make_bsdf():
         sampling   string    "data" (default): light directions by the data; "cosine": by the cosine, for comparison
         views      string    indices of the measured views to keep, such as "0 3 17"; default: all. A lookup that needs
                              another one gives no number
+        lights     string    likewise of the lights
         lod        string    level of detail: "auto" (default), by the pixel's footprint; "distance", log2 of it; "none"
         lod_bias   float     added to the level of detail, so that "none" with a bias is a fixed level; default 0
         lod_unit   float     distance whose level of detail is 0 in mode "distance", > 0; default 1
@@ -111,7 +112,8 @@ def make_bsdf():
                 raise InputError("the plugin 'btf' needs a file", field="filename")
             representation = load(
                 str(mi.file_resolver().resolve(str(self.filename))),
-                views=_indices(_parameter(props, "views", None)),
+                views=_indices(props, "views"),
+                lights=_indices(props, "lights"),
             )
             own = representation.meta["filter_type"]
             self.filter_type = _choice(props, "filter_type", own, FILTER_TYPES)
@@ -277,14 +279,15 @@ def _choice(props, name, default, choices):
     return value
 
 
-def _indices(text):
-    """Whole numbers of a text, separated by spaces or commas; None for None."""
+def _indices(props, name):
+    """Whole numbers of a parameter, separated by spaces or commas; None where there is none."""
+    text = _parameter(props, name, None)
     if text is None:
         return None
     try:
         return [int(word) for word in str(text).replace(",", " ").split()]
     except ValueError:
-        raise InputError("not a list of views", field="views", got=repr(text)) from None
+        raise InputError("not a list of indices", field=name, got=repr(text)) from None
 
 
 def _number(props, name, default, *, least=-np.inf, positive=False):

@@ -56,6 +56,12 @@ def cell_densities(mean, lights):
         Positive; mean over the cells 1, at least ``COSINE_SHARE``.
     """
     w = cell_directions()
+    if hasattr(lights, "slots"):
+        # Lights that are not kept are not sampled by the data either: they count as black.
+        mean = np.where(
+            lights.slots == interpolation.MISSING, 0, mean[..., np.minimum(lights.slots, mean.shape[-1] - 1)]
+        )
+        lights = lights.inner
     index, weight = lights.stencil(w, hold=False)
     weight = weight / w[..., 2:] / w.shape[1]
     operator = np.zeros((N_CELLS, mean.shape[-1]))

@@ -236,11 +236,21 @@ class TriangleTable:
 
 
 class ResidentTable:
-    """Port of :class:`btfref.numerics.interpolation.ResidentInterpolation`: views that are not kept give no number."""
+    """Port of :class:`btfref.numerics.interpolation.ResidentInterpolation`: what is not kept gives no number."""
 
     def __init__(self, inner, slots):
-        self.inner, self.slots = inner, mi.UInt32(np.ascontiguousarray(slots[:, 0]))
+        self.inner, self._table = inner, np.ascontiguousarray(slots[:, 0])
+        self.slots = mi.UInt32(self._table)
         dr.eval(self.slots)
+
+    def following(self):
+        """The slot of the next sample on each kept one's ring; of one that is not kept, its own."""
+        following = self.inner.following()
+        if following is None:
+            return None
+        kept = np.flatnonzero(self._table != MISSING)
+        after = self._table[following[kept]]
+        return np.where(after == MISSING, self._table[kept], after).astype(np.int64)
 
     def stencil(self, w, *, hold=True):
         """As the table's own, in slots."""
@@ -253,6 +263,12 @@ class ResidentTable:
         result = []
         for neighbour in self.inner.stencil(w, hold=hold):
             pairs = [kept(*pair) for pair in neighbour.single()]
+            if len(pairs) == 2 and not hold:
+                # Packed tables reach the second light through the first one: without it there is no number either.
+                (slot, weight), (after, after_weight) = pairs
+                absent = dr.gather(mi.UInt32, self.slots, neighbour.index) == MISSING
+                pairs[1] = after, dr.select(absent & (after_weight > 0), dr.nan, after_weight)
+                pairs[0] = slot, weight
             result.append(Neighbour(*(value for pair in pairs for value in pair)))
         return result
 

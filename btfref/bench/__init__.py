@@ -8,6 +8,7 @@ from __future__ import annotations
 
 #: Suites by name.
 SUITES = {
+    "demand": "btfref.bench.demand",
     "environment": "btfref.bench.environment",
     "factors": "btfref.bench.factors",
     "gbrdf": "btfref.bench.gbrdf",

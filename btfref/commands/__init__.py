@@ -15,6 +15,7 @@ COMMANDS = (
     "render",
     "realtime",
     "compare",
+    "demand",
     "bench",
     "stress",
 )

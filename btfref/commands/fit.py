@@ -26,6 +26,11 @@ def add_arguments(parser):
         metavar="E",
         help="short for --set target_error=E: relative RMS error, for methods that can aim at one",
     )
+    parser.add_argument(
+        "--partial",
+        action="store_true",
+        help="take a store of which only a part is there, as synth --for fills it (methods that can)",
+    )
     parser.add_argument("--seed", type=count(0), default=0, metavar="N")
     parser.add_argument("--json", action="store_true", help="print the facts of the file as JSON")
 
@@ -42,11 +47,14 @@ def run(args):
     parameters = fit_parameters(row, args.preset, given)
 
     from btfref.representations.container import read_info, save
-    from btfref.sampling import SampledBTF
+    from btfref.sampling import SampledBTF, open_store
 
-    btf = SampledBTF.load(args.btf)
-    with Progress() as progress:
-        representation = row.fit(btf, seed=args.seed, progress=progress, **parameters)
+    if args.partial:
+        representation = row.fit_partial(open_store(args.btf), **parameters)
+    else:
+        btf = SampledBTF.load(args.btf)
+        with Progress() as progress:
+            representation = row.fit(btf, seed=args.seed, progress=progress, **parameters)
     save(representation, out)
     info = read_info(out)
     if args.json:

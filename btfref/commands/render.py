@@ -9,7 +9,7 @@ path traced.
 
 from __future__ import annotations
 
-from btfref.commands._shared import assignments, count, output_file, size, write_images
+from btfref.commands._shared import assignments, count, emit, output_file, size, write_images
 from btfref.errors import InputError
 from btfref.scenes import scene_file
 
@@ -30,6 +30,13 @@ def add_arguments(parser):
         "--noise-free", type=count(1), metavar="N", help="regular N × N grid per pixel, delta lights"
     )
     parser.add_argument("--no-shadows", action="store_true", help="direct light without cast shadows")
+    parser.add_argument(
+        "--maps",
+        choices=("all", "needed"),
+        default="all",
+        help="maps to load: all, or those that the camera's first hits need",
+    )
+    parser.add_argument("--debug", action="store_true", help="a channel that is no number is an error")
     parser.add_argument("--size", type=size, metavar="WxH", help="of the film, in pixels")
     parser.add_argument("--geometry", action="store_true", help="path trace the mesostructure itself")
     parser.add_argument("--classes", metavar="C.png", help="also write the pixel classes (for compare)")
@@ -61,7 +68,11 @@ def run(args):
             noise_free=args.noise_free,
             shadows=not args.no_shadows,
             size=args.size,
+            maps=args.maps,
+            debug=args.debug,
         )
+    if lost := result.meta.get("not_finite"):
+        emit(f"{lost} channels are no numbers: lookups outside of what the file holds, or broken materials")
     classes = None
     if classes_out:
         from btfref.render.classes import pixel_classes

@@ -7,10 +7,14 @@ it now, and the same command with another part, or without, fills more later (bt
   btfref synth checker -o checker.btf.zarr --views ubo81 --lights ubo81 --spp 16
   btfref synth stone.png -o stone.btf.zarr --albedo stone-colour.png --roughness 0.6 --amplitude 0.1
   btfref synth cloth.glb -o cloth.btf.zarr --target-error 0.02 --memory 4G
+  btfref synth checker -o checker.btf.zarr --for plane --size 512x512
   btfref synth weave.ply --bsdf yarn.xml -o weave.btf.zarr --scheduler dask --workers 4
 """
 
 from __future__ import annotations
+
+import functools
+import operator
 
 from btfref.commands._shared import (
     Progress,
@@ -26,6 +30,7 @@ from btfref.commands._shared import (
     positive,
     ranges,
 )
+from btfref.commands.demand import add_scene_arguments, union, whole_shape
 from btfref.errors import InputError
 
 #: Options that are parameters of a user's mesh or height map.
@@ -107,6 +112,15 @@ def add_arguments(parser):
         parser.add_argument(
             f"--only-{name}", type=ranges, metavar="I,J-K", help=f"fill these {name} now, the rest later"
         )
+    needs = parser.add_argument_group("fill only what scenes need (see btfref demand), the rest later")
+    needs.add_argument(
+        "--for",
+        dest="scenes",
+        action="append",
+        metavar="SCENE",
+        help="scene file or shipped scene; several need what any of them needs",
+    )
+    add_scene_arguments(needs)
     parser.add_argument(
         "--memory",
         type=memory_size,
@@ -158,6 +172,13 @@ def run(args):
     from btfref.sampling.synthesis import synthesize_store
 
     only = Part(args.only_views, args.only_lights, args.only_tiles)
+    if args.scenes:
+        if only != Part():
+            raise InputError("scenes say what is filled", field="--only-…", got="beside --for")
+        found = union(args, args.scenes, whole_shape(args.views, args.lights, args.texels)).values()
+        only = functools.reduce(operator.or_, found).part()
+    elif args.define or args.sweep or args.indirect:
+        raise InputError("these are parameters of scenes", field="-D, --sweep, --indirect", expected="--for")
 
     peak = []
     with Progress() as progress:

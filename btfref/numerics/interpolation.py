@@ -235,11 +235,13 @@ class ResidentInterpolation:
     Parameters
     ----------
     inner : RingInterpolation or TriangleInterpolation
-    slots : ndarray of uint32, shape (n_views, 1)
+    slots : ndarray of uint32, shape (n, 1)
+    kind : {"view", "light"}
+        For messages.
     """
 
-    def __init__(self, inner, slots):
-        self.inner, self.slots = inner, slots[:, 0].astype(np.int64)
+    def __init__(self, inner, slots, kind="view"):
+        self.inner, self.slots, self.kind = inner, slots[:, 0].astype(np.int64), kind
 
     def stencil(self, w, **settings):
         """As the interpolation's own, in slots.
@@ -247,7 +249,7 @@ class ResidentInterpolation:
         Raises
         ------
         InputError
-            When a view with weight is not kept.
+            When a sample with weight is not kept.
         """
         index, weight = self.inner.stencil(w, **settings)
         slot = self.slots[index]
@@ -255,8 +257,8 @@ class ResidentInterpolation:
         needed = absent & (weight > 0)
         if needed.any():
             raise InputError(
-                "a lookup needs views that are not resident",
-                field="views",
+                f"a lookup needs {self.kind}s that are not resident",
+                field=f"{self.kind}s",
                 got=", ".join(map(str, np.unique(index[needed])[:8])),
             )
         return np.where(absent, 0, slot), weight
@@ -272,4 +274,4 @@ def from_arrays(arrays, prefix):
     else:
         found = TriangleInterpolation(arrays[f"{prefix}_triangles"], arrays[f"{prefix}_cells"])
     slots = arrays.get(f"{prefix}_slots")
-    return found if slots is None else ResidentInterpolation(found, slots)
+    return found if slots is None else ResidentInterpolation(found, slots, prefix)

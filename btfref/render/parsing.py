@@ -101,7 +101,7 @@ def use_variant(name):
         mi.set_variant(name)
 
 
-def parse(scene, parameters=None, *, variant, size=None):
+def parse(scene, parameters=None, *, variant, size=None, missing_btf=False):
     """Parse a scene for the current variant.
 
     Parameters
@@ -114,6 +114,8 @@ def parse(scene, parameters=None, *, variant, size=None):
         The current variant.
     size : (int, int), optional
         Width and height of the film in place of the scene's.
+    missing_btf : bool
+        Leave the names of BTF files that do not exist as they are.
 
     Returns
     -------
@@ -148,10 +150,24 @@ def parse(scene, parameters=None, *, variant, size=None):
         raise InputError(one_line(error), file=source) from error
     parsed = ParsedScene(state, config, source)
     for node in parsed.nodes:
-        _resolve_file(parsed, node, None if is_dict else Path(scene).resolve().parent)
+        _resolve_file(parsed, node, None if is_dict else Path(scene).resolve().parent, missing_btf)
         if _is(node, "Film") and size is not None:
             node.props["width"], node.props["height"] = int(size[0]), int(size[1])
     return parsed
+
+
+def plain(parsed):
+    """Replace what the geometry does not need, so that no material, texture or integrator is loaded."""
+    import mitsuba as mi
+
+    for node in parsed.nodes:
+        kinds = {"BSDF": "diffuse", "Integrator": "direct"}
+        kind = next((k for k in kinds if is_kind(node, k)), None)
+        if kind:
+            for key in list(node.props.keys()):
+                del node.props[key]
+            node.props.set_plugin_name(kinds[kind])
+            node.type = getattr(mi.ObjectType, kind)
 
 
 def _is(node, kind):
@@ -166,7 +182,7 @@ def is_kind(node, kind):
     return _is(node, kind) or (kind == "BSDF" and node.props.plugin_name() == BTF)
 
 
-def _resolve_file(parsed, node, beside):
+def _resolve_file(parsed, node, beside, missing_btf=False):
     """Make the node's relative file name absolute.
 
     Mitsuba looks beside the scene file only when it loads the file itself. BTF files come from the command
@@ -184,7 +200,7 @@ def _resolve_file(parsed, node, beside):
             return
     if node.props.plugin_name() == "envmap":
         _shipped_environment(parsed, node, name)
-    if is_btf:
+    if is_btf and not missing_btf:
         raise InputError("no such BTF file", file=parsed.location(node), field="filename", got=name)
 
 

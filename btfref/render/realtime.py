@@ -13,7 +13,7 @@ import time
 import numpy as np
 
 from btfref import representations
-from btfref.demand import scene_views
+from btfref.demand import MARGIN, kept_directions
 from btfref.errors import BtfrefError, InputError
 from btfref.render import gl
 from btfref.render.lighting import lighting_of
@@ -86,12 +86,12 @@ def realtime(
     if views == "needed":
         if isinstance(scene, SceneDescription):
             raise InputError("the views that are needed follow from a scene file", field="views", got=views)
-        needed = scene_views(scene, parameters=parameters, grid=grid, size=size)
+        needed = kept_directions(scene, parameters, grid=grid, size=size, margin=MARGIN)
     if not isinstance(scene, SceneDescription):
         scene = read_scene(scene, parameters, size=size)
 
     def load_needed(path):
-        return representations.load(path, views=needed[path])
+        return representations.load(path, **needed[path])
 
     lighting = lighting_of(scene, environment, lights=lights, order=order, window=window)
     load_file = load_needed if needed else None
@@ -115,7 +115,8 @@ def realtime(
             "triangles": sum(len(mesh.faces) for mesh in scene.meshes),
             "lights": len(scene.lights),
             "environment": scene.environment.name if scene.environment else None,
-            "resident_views": {name: len(kept) for name, kept in needed.items()} if needed else None,
+            "resident_views": _count(needed, "views"),
+            "resident_lights": _count(needed, "lights"),
             **renderer.environment_facts,
             **gl.facts(renderer.ctx),
         }
@@ -128,6 +129,13 @@ def realtime(
             f"{meta['not_finite']} channels needed views that were not kept; render with all views"
         )
     return RenderResult(image, None, meta)
+
+
+def _count(needed, kind):
+    """Directions kept by file, where they were chosen."""
+    if not needed:
+        return None
+    return {file: None if kept[kind] is None else len(kept[kind]) for file, kept in needed.items()}
 
 
 class Renderer:

@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 
-from btfref.errors import InputError
+from btfref.errors import BtfrefError, InputError
 from btfref.render import parsing
 from btfref.render.result import RenderResult
 
@@ -30,6 +30,8 @@ def render(
     size=None,
     with_variance=False,
     grid=None,
+    maps="all",
+    debug=False,
 ):
     """Render a scene with Mitsuba.
 
@@ -58,6 +60,13 @@ def render(
     grid : int, optional
         Direct light only, at n × n regular sub-pixel positions as ``noise_free``, but with random directions of the
         light, so that environments are possible; always with a variance.
+    maps : {"all", "needed"}
+        "needed" loads the maps of those views alone that the cameras' first hits need, and without noise those of the
+        lights as well, of methods that keep maps by direction: the same picture bit by bit. ``meta["maps"]`` says how
+        many, by file.
+    debug : bool
+        A channel that is no number is an error. ``meta["not_finite"]`` counts them in any case: lookups outside of what
+        a file or ``maps`` holds give none.
 
     Returns
     -------
@@ -67,13 +76,26 @@ def render(
     ------
     InputError
         For scenes that Mitsuba cannot load, and lights that ``noise_free`` cannot handle.
+    BtfrefError
+        When a pixel needed maps that were not loaded (light that was reflected twice can), or with ``debug`` is no
+        number for another reason.
     MissingDependencyError
         Without a usable LLVM for an llvm variant.
     """
     for name, value in (("spp", spp), ("noise_free", noise_free), ("grid", grid)):
         if value is not None and value < 1:
             raise InputError("at least one sample is needed", field=name, got=value, expected="≥ 1")
-    with loaded(scene, parameters, variant=variant, size=size) as made:
+    if maps not in ("all", "needed"):
+        raise InputError("unknown choice of maps", field="maps", got=maps, expected="all or needed")
+    kept = {}
+    if maps == "needed":
+        from btfref.demand import MARGIN, kept_directions
+
+        lit = noise_free is not None
+        kept = kept_directions(
+            scene, parameters, lights=lit, grid=noise_free or 4, size=size, margin=MARGIN if lit else None
+        )
+    with loaded(scene, parameters, variant=variant, size=size, kept=kept) as made:
         tell_camera(
             made, 1 / (noise_free or grid) if noise_free or grid else (spp or _sample_count(made)) ** -0.5
         )
@@ -89,19 +111,31 @@ def render(
         else:
             image, variance, settings = _monte_carlo(made, spp, seed, with_variance, shadows)
         seconds = time.perf_counter() - start
+    settings["not_finite"] = lost = int(np.count_nonzero(~np.isfinite(image)))
+    if lost and (debug or kept):
+        cause = "needed maps that were not loaded; render with all maps" if kept else "are no numbers"
+        raise BtfrefError(f"{lost} channels {cause}")
+    if kept:
+        settings["maps"] = {
+            file: {k: len(v) for k, v in chosen.items() if v is not None} for file, chosen in kept.items()
+        }
     facts = {"renderer": "mitsuba", "variant": variant, "rfilter": "box", "component_format": "float32"}
     return RenderResult(image, variance, {**facts, **settings, "seconds": seconds, **_versions()})
 
 
 class loaded:  # noqa: N801 - a context manager that reads as a verb
-    """``with loaded(scene, parameters, variant=…, size=…) as mitsuba_scene``; restores the variant."""
+    """``with loaded(scene, parameters, variant=…, size=…) as mitsuba_scene``; restores the variant.
 
-    def __init__(self, scene, parameters=None, *, variant="llvm_ad_rgb", size=None):
-        self._arguments = scene, parameters, variant, size
+    ``plain`` loads the shapes alone: materials become diffuse, and BTF files need not exist. ``kept`` says which
+    directions' maps are loaded: file to the materials' parameters ``views`` and ``lights``.
+    """
+
+    def __init__(self, scene, parameters=None, *, variant="llvm_ad_rgb", size=None, plain=False, kept=None):
+        self._arguments = scene, parameters, variant, size, plain, kept
         self._before = None
 
     def __enter__(self):
-        scene, parameters, variant, size = self._arguments
+        scene, parameters, variant, size, plain, kept = self._arguments
         if variant.startswith("llvm"):
             from btfref.platform import prepare_llvm
 
@@ -115,10 +149,17 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
                 import mitsuba_plugins
 
                 mitsuba_plugins.register()
-            parsed = parsing.parse(scene, parameters, variant=variant, size=size)
+            parsed = parsing.parse(scene, parameters, variant=variant, size=size, missing_btf=plain)
             for index in [i for i, node in enumerate(parsed.nodes) if parsing.is_kind(node, "Film")]:
                 _plain_film(parsed, index)
             btf_shapes = _btf_shapes(parsed)
+            if plain:
+                parsing.plain(parsed)
+            for node in parsed.nodes:
+                if kept and node.props.plugin_name() == parsing.BTF:
+                    for name, chosen in kept[node.props["filename"]].items():
+                        if chosen is not None:
+                            node.props[name] = " ".join(map(str, chosen))
             made = parsed.instantiate()
             if not isinstance(made, mi.Scene):
                 raise InputError("the file does not describe a scene", file=parsed.source)

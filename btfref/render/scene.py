@@ -122,7 +122,7 @@ class SceneDescription:
     environment: Environment | None = None
 
 
-def read_scene(scene, parameters=None, *, size=None):
+def read_scene(scene, parameters=None, *, size=None, missing_btf=False):
     """Read a Mitsuba scene.
 
     Parameters
@@ -132,6 +132,8 @@ def read_scene(scene, parameters=None, *, size=None):
         Values for ``$name`` in the file.
     size : (int, int), optional
         Width and height of the film in place of the scene's.
+    missing_btf : bool
+        Accept BTF files that do not exist yet.
 
     Returns
     -------
@@ -153,14 +155,14 @@ def read_scene(scene, parameters=None, *, size=None):
     before = mi.variant()
     parsing.use_variant(VARIANT)
     try:
-        parsed = parsing.parse(scene, parameters, variant=VARIANT, size=size)
+        parsed = parsing.parse(scene, parameters, variant=VARIANT, size=size, missing_btf=missing_btf)
         roots = parsed.children(parsed.state.root)
         nodes = {
             kind: [n for _, n in roots if parsing.is_kind(n, kind)] for kind in ("Sensor", "Emitter", "Shape")
         }
         _check(parsed, nodes)
         materials = [_material(parsed, node) for node in nodes["Shape"]]
-        _plain(parsed)
+        parsing.plain(parsed)
         made = parsed.instantiate()
         if not isinstance(made, mi.Scene) or len(made.shapes()) != len(nodes["Shape"]):
             raise InputError("the file does not describe one scene of separate shapes", file=parsed.source)
@@ -273,20 +275,6 @@ def _material(parsed, shape):
         props["filename"], filter_type, numbers.pop("scale", 1.0), affine, twosided, lod=mode, **numbers
     )
     return plugin, material
-
-
-def _plain(parsed):
-    """Replace what the geometry does not need, so that no material, texture or integrator is loaded."""
-    import mitsuba as mi
-
-    for node in parsed.nodes:
-        kinds = {"BSDF": "diffuse", "Integrator": "direct"}
-        kind = next((k for k in kinds if parsing.is_kind(node, k)), None)
-        if kind:
-            for key in list(node.props.keys()):
-                del node.props[key]
-            node.props.set_plugin_name(kinds[kind])
-            node.type = getattr(mi.ObjectType, kind)
 
 
 def _camera(sensor):

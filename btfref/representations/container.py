@@ -18,7 +18,7 @@ import numpy as np
 from btfref.conventions import SCHEMA_VERSION
 from btfref.errors import InputError
 from btfref.registry import method
-from btfref.representations.resident import axes_of, select_views
+from btfref.representations.resident import select
 
 ATTRIBUTE = "btfref"
 MAXIMUM_WIDTH = 8192
@@ -96,14 +96,14 @@ def save(representation, path):
         raise
 
 
-def load(path, *, views=None):
+def load(path, *, views=None, lights=None):
     """Read a representation.
 
     Parameters
     ----------
     path : path-like
-    views : array_like of int, optional
-        Keep the maps of these views only; see :mod:`btfref.representations.resident`.
+    views, lights : array_like of int, optional
+        Keep the maps of these directions only; see :mod:`btfref.representations.resident`.
 
     Returns
     -------
@@ -113,18 +113,19 @@ def load(path, *, views=None):
     ------
     InputError
         When the file is missing, empty, not an OpenEXR file, truncated, written by a newer schema, of an unknown
-        method, or holds a value that is not finite; when ``views`` cannot be chosen.
+        method, or holds a value that is not finite; when ``views`` or ``lights`` cannot be chosen.
     """
     manifest, parts = _open(path, header_only=False)
     arrays = {}
     for name, entry in manifest["arrays"].items():
         if name not in parts:
             raise InputError("a map is missing", file=path, field=name)
-        arrays[name] = _read_map(path, name, entry, parts[name])
+        arrays[name] = _read_map(
+            path, name, entry, parts[name], partial=manifest["meta"].get("partial", False)
+        )
     meta = manifest["meta"]
     kind = method(meta["method"], file=path).representation
-    if views is not None:
-        arrays, meta = select_views(arrays, meta, axes_of(kind, meta["method"], file=path), views, file=path)
+    arrays, meta = select(arrays, meta, kind, views=views, lights=lights, file=path)
     return kind.from_arrays(arrays, meta)
 
 
@@ -254,7 +255,7 @@ def _open(path, *, header_only):
     return manifest, parts
 
 
-def _read_map(path, name, entry, part):
+def _read_map(path, name, entry, part, *, partial=False):
     shape = tuple(entry["shape"])
     byte = entry["dtype"] == "uint8"
     result = np.zeros((*image_size(shape), shape[-1]), "float16" if byte else entry["dtype"])
@@ -270,7 +271,9 @@ def _read_map(path, name, entry, part):
                 expected=f"{result.dtype} {result.shape[:2]}",
             )
         result[..., i] = pixels
-    if result.dtype.kind == "f" and not np.isfinite(result).all():
+    # What a partial table lacks stands in it as NaN, and gives NaN where it is asked for.
+    broken = np.isinf if partial else lambda values: ~np.isfinite(values)
+    if result.dtype.kind == "f" and broken(result).any():
         raise InputError("a map holds a value that is not finite", file=path, field=name)
     if byte:
         if ((result < 0) | (result > 1)).any():

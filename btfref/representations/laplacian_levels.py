@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 
@@ -23,6 +24,9 @@ class Representation(StoredMaps):
     before those of Cb and Cr; ``mean`` [view, light, 3] or ``phong`` [1, 6] = (k_a, k_d, k_s, α, Cb, Cr); the
     direction tables. ``meta["levels"]`` lists rows, columns and numbers of components of each level.
     """
+
+    VIEW_AXES: ClassVar = {"basis_*": 0, "mean": 0}
+    LIGHT_AXES: ClassVar = {"basis_*": 1, "mean": 1}
 
     @property
     def max_lod(self):
@@ -116,7 +120,11 @@ class Representation(StoredMaps):
         most = [constants[f"n_{name}"] for name in ("y", "cb", "cr")]
         first = np.cumsum([0, *most])
         n_views, n_lights = (len(self.maps[f"{kind}_directions"]) for kind in ("view", "light"))
-        kind = next((a.dtype for name, a in self.maps.items() if name.startswith("basis_")), np.float32)
+        kind = np.float32
+        for name, table in self.maps.items():
+            if name.startswith("basis_"):
+                # Of fewer directions where some are not kept.
+                n_views, n_lights, kind = *table.shape[:2], table.dtype
         levels = self.meta["levels"][: constants["n_levels"]]
         basis = np.zeros((len(levels), n_views, n_lights, first[-1]), kind)
         weights = []

@@ -8,6 +8,8 @@ VMV 2003; the same authors, "Fast Environmental Lighting for Local-PCA Encoded B
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from btfref import conventions
@@ -42,6 +44,9 @@ class Representation(StoredMaps):
     ``basis`` [cluster, 1 + component, view, light, 3] with the cluster's mean first, ``weights``
     [row, column, component], ``cluster`` [row, column, 1] uint32, and the direction tables.
     """
+
+    VIEW_AXES: ClassVar = {"basis": 2}
+    LIGHT_AXES: ClassVar = {"basis": 3}
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored.

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from btfref import conventions
 from btfref.errors import InputError
 from btfref.representations.guide import feature_views, group_means, texel_groups
-from btfref.representations.lookup import StoredMaps, base_meta, direction_arrays, evaluate_tabulated
+from btfref.representations.lookup import (
+    StoredMaps,
+    base_meta,
+    direction_arrays,
+    evaluate_tabulated,
+    meta_for,
+)
+from btfref.representations.resident import slots_name, slots_of
 
 PRESETS = {"paper": {}}
 
@@ -15,20 +24,22 @@ PRESETS = {"paper": {}}
 class Representation(StoredMaps):
     """Table ``values`` [row, column, view, light, 3] and the directions it is sampled at."""
 
+    VIEW_AXES: ClassVar = {"values": 2}
+    LIGHT_AXES: ClassVar = {"values": 3}
+
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored."""
         values = self.maps["values"]
         table = values.reshape(-1, *values.shape[2:])
+        partial = self.meta.get("partial", False)
 
         def kernel(s):
             index = (s.texel[:, :, None, None], s.view[:, None, :, None], s.light[:, None, None, :])
-            return np.einsum(
-                "nt,nv,nl,ntvlc->nc",
-                s.texel_weight,
-                s.view_weight,
-                s.light_weight,
-                table[index].astype(float),
-            )
+            found = table[index].astype(float)
+            result = np.einsum("nt,nv,nl,ntvlc->nc", s.texel_weight, s.view_weight, s.light_weight, found)
+            if partial and np.isnan(result).any():
+                raise InputError("a lookup needs texels that are not resident", field="texels")
+            return result
 
         return evaluate_tabulated(self, kernel, uv, w_light, w_view)
 
@@ -36,6 +47,9 @@ class Representation(StoredMaps):
         """Groups of texels alike, and their means."""
         values = self.maps["values"]
         table = values.reshape(-1, *values.shape[2:])
+        if self.meta.get("partial", False):
+            # What is not there is not sampled by the data either.
+            table = np.nan_to_num(table)
         some = conventions.luminance(table[:, feature_views(table.shape[1])].astype(np.float32))
         labels = texel_groups(some.reshape(len(table), -1))
         return labels.reshape(values.shape[:2]), conventions.luminance(group_means(labels, table))
@@ -65,3 +79,53 @@ def fit(btf, *, seed=0, progress=None, filter_type="bilinear"):
     values = np.ascontiguousarray(np.transpose(btf.values, (2, 3, 0, 1, 4)))
     meta = base_meta("raw", btf, {}, filter_type=filter_type)
     return Representation({"values": values, **direction_arrays(btf.views, btf.lights)}, meta)
+
+
+def fit_partial(store, *, filter_type="bilinear"):
+    """The table of what is there of a store, with the directions of all of it: lookups in that part are the whole's.
+
+    Parameters
+    ----------
+    store : btfref.sampling.store.BTFStore
+        Filled in part, as by ``btfref synth --for``; views or lights without any sample are left out of the table,
+        samples that are missing between others are NaN.
+    filter_type : {"bilinear", "nearest"}
+
+    Returns
+    -------
+    Representation
+        A lookup that needs more is an error in NumPy and no number in the ports.
+
+    Raises
+    ------
+    InputError
+        For a store without any sample, or values that are not finite.
+    """
+    coverage = store.coverage
+    views, lights = np.flatnonzero(coverage.any((1, 2, 3))), np.flatnonzero(coverage.any((0, 2, 3)))
+    if not len(views):
+        raise InputError("nothing of it is there yet", file=store.path, field="coverage")
+    values = np.full((*store.texels, len(views), len(lights), 3), np.nan, store.dtype)
+    for tile in np.ndindex(coverage.shape[2:]):
+        rows, columns = (
+            slice(k * t, min((k + 1) * t, n)) for k, t, n in zip(tile, store.tile, store.texels, strict=True)
+        )
+        for first in range(len(views)):
+            there = np.flatnonzero(coverage[views[first], lights, *tile])
+            if len(there):
+                part, _ = store.read(
+                    views=[views[first]], lights=lights[there], rows=rows, columns=columns, variance=False
+                )
+                values[rows, columns, first, there] = np.moveaxis(part[0], 0, 2)
+    arrays = {"values": values, **direction_arrays(store.views, store.lights)}
+    arrays["view_directions"] = np.ascontiguousarray(arrays["view_directions"][views])
+    meta = meta_for(
+        "raw", store.texels, store.views, store.lights, {}, filter_type=filter_type, parent=store.attributes
+    )
+    for kind, directions, kept in (("view", store.views, views), ("light", store.lights, lights)):
+        if len(kept) < len(directions):
+            arrays[slots_name(kind)] = slots_of(len(directions), kept)
+            meta[f"resident_{kind}s"] = kept.tolist()
+    if np.isnan(values).any():
+        meta["partial"] = True
+    return Representation(arrays, meta)

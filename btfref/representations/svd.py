@@ -6,6 +6,8 @@ Texture Functions", Texture 2003. ``B_x = Σ_c w_{x,c} E_c``, without a mean.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from btfref import conventions
@@ -27,6 +29,9 @@ PRESETS = {"paper": {"components": 150, "storage": "float"}}
 
 class Representation(StoredMaps):
     """Maps: ``basis`` [component, view, light, 3], ``weights`` [row, column, component], direction tables."""
+
+    VIEW_AXES: ClassVar = {"basis": 1}
+    LIGHT_AXES: ClassVar = {"basis": 2}
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored.

@@ -1,5 +1,5 @@
 // Provides view_stencil and light_stencil: neighbours of a direction among the measured ones; directions_valid.
-// Expects the samplers view_rings or view_triangles and view_cells, the same for light_, and light_directions; view_slots.
+// Expects the samplers view_rings or view_triangles and view_cells, the same for light_, and light_directions; view_slots, light_slots.
 
 #include "lib/rings.glsl"
 #include "lib/triangles.glsl"
@@ -23,6 +23,10 @@ uniform sampler2DArray light_triangles;
 uniform sampler2DArray light_cells;
 #endif
 
+#ifdef LIGHT_SLOTS_DIM0
+uniform usampler2DArray light_slots;
+#endif
+
 // Above the horizon and neither NaN nor far from unit length (comparisons with NaN are false). The least z is the
 // smallest normal float: where subnormal ones are flushed to 0 the answer is the same.
 bool direction_valid(vec3 w) {
@@ -34,6 +38,19 @@ bool directions_valid(vec3 w_light, vec3 w_view) {
     return direction_valid(w_light) && direction_valid(w_view);
 }
 
+#if defined(VIEW_SLOTS_DIM0) || defined(LIGHT_SLOTS_DIM0)
+Stencil kept_samples(usampler2DArray slots, Stencil s) {
+    for (int i = 0; i < 4; ++i) {
+        uint slot = table_fetch(slots, s.index[i]).r;
+        // 0xffffffff: not kept. A weight that is no number shows in the picture, and is counted there.
+        bool absent = slot == 0xffffffffu;
+        s.index[i] = absent ? 0 : int(slot);
+        s.weight[i] = absent && s.weight[i] > 0.0 ? uintBitsToFloat(0x7fc00000u) : s.weight[i];
+    }
+    return s;
+}
+#endif
+
 Stencil view_stencil(vec3 w) {
 #ifdef VIEW_RINGS_DIM0
     Stencil s = ring_stencil(view_rings, VIEW_RINGS_DIM0, w);
@@ -41,13 +58,7 @@ Stencil view_stencil(vec3 w) {
     Stencil s = triangle_stencil(view_triangles, VIEW_TRIANGLES_DIM0, view_cells, VIEW_CELLS_DIM0, w, false);
 #endif
 #ifdef VIEW_SLOTS_DIM0
-    for (int i = 0; i < 4; ++i) {
-        uint slot = table_fetch(view_slots, s.index[i]).r;
-        // 0xffffffff: not kept. A weight that is no number shows in the picture, and is counted there.
-        bool absent = slot == 0xffffffffu;
-        s.index[i] = absent ? 0 : int(slot);
-        s.weight[i] = absent && s.weight[i] > 0.0 ? uintBitsToFloat(0x7fc00000u) : s.weight[i];
-    }
+    s = kept_samples(view_slots, s);
 #endif
     return s;
 }
@@ -58,8 +69,11 @@ Stencil light_stencil(vec3 w) {
     Stencil s = ring_stencil(light_rings, LIGHT_RINGS_DIM0, w);
     float cos_last = table_fetch(light_directions, LIGHT_DIRECTIONS_DIM0 - 1).z;
     s.weight *= ring_fade(light_rings, LIGHT_RINGS_DIM0, w, cos_last);
-    return s;
 #else
-    return triangle_stencil(light_triangles, LIGHT_TRIANGLES_DIM0, light_cells, LIGHT_CELLS_DIM0, w, true);
+    Stencil s = triangle_stencil(light_triangles, LIGHT_TRIANGLES_DIM0, light_cells, LIGHT_CELLS_DIM0, w, true);
 #endif
+#ifdef LIGHT_SLOTS_DIM0
+    s = kept_samples(light_slots, s);
+#endif
+    return s;
 }

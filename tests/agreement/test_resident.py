@@ -1,5 +1,6 @@
 """Representations of which only some views are kept: equal where these suffice, never another view's value."""
 
+import fnmatch
 from importlib.resources import files
 
 import numpy as np
@@ -13,38 +14,46 @@ from btfref.registry import methods
 from btfref.render.probe import probe
 from btfref.render.realtime import realtime
 from btfref.representations import load, save
-from btfref.representations.resident import SLOTS, with_views
+from btfref.representations.resident import KINDS, SLOTS, with_views
 
-KEYS = [key for key, row in methods().items() if getattr(row.representation, "VIEW_AXES", None)]
+CASES = [
+    (key, kind)
+    for key, row in methods().items()
+    for kind, axes in KINDS.items()
+    if getattr(row.representation, axes, None)
+]
 PLANE = files("btfref.scenes").joinpath("plane.xml")
 
 
-def lookups(rng, representation, views, n=4000):
-    """Random lookups, and whether the kept views suffice for each."""
+def lookups(rng, representation, kind, chosen, n=4000):
+    """Random lookups, and whether the kept views, or lights, suffice for each."""
     uv, w_light, w_view = rng.uniform(size=(n, 2)).astype(np.float32), hemisphere(rng, n), hemisphere(rng, n)
-    index, weight = interpolation.from_arrays(representation.arrays(), "view").stencil(w_view)
+    w = w_view if kind == "view" else w_light
+    index, weight = interpolation.from_arrays(representation.arrays(), kind).stencil(w)
     # Neighbours with a weight of rounding size may or may not count in float32.
     clear = ((weight == 0) | (weight > 1e-4)).all(1)
-    absent = ~np.isin(index, views) & (weight > 0)
+    absent = ~np.isin(index, chosen) & (weight > 0)
     return (uv[clear], w_light[clear], w_view[clear]), ~absent.any(1)[clear]
 
 
-@pytest.mark.parametrize("kind", ["ubo81", "triangles"])
-@pytest.mark.parametrize("key", KEYS)
-def test_kept_views_give_the_same_numbers_and_others_none(need, fits, llvm, rng, key, kind):
+@pytest.mark.parametrize("directions", ["ubo81", "triangles"])
+@pytest.mark.parametrize(("key", "kind"), CASES)
+def test_kept_directions_give_the_same_numbers_and_others_none(need, fits, llvm, rng, key, kind, directions):
     import drjit as dr
 
     import mitsuba_plugins
 
     need("gl")
-    whole, path = fits(key, kind), fits.path(key, kind)
-    total = len(whole.maps["view_directions"])
+    whole, path = fits(key, directions), fits.path(key, directions)
+    total = whole.meta[f"{kind}s"]["count"]
     kept = 2 * total // 3
-    views = np.sort(rng.choice(total, kept, replace=False))
-    some = load(path, views=views)
-    for name, axis in type(whole).VIEW_AXES.items():
-        assert some.maps[name].shape[axis] == kept
-    points, enough = lookups(rng, whole, views)
+    chosen = np.sort(rng.choice(total, kept, replace=False))
+    some = load(path, **{f"{kind}s": chosen})
+    for pattern, axis in getattr(type(whole), KINDS[kind]).items():
+        names = fnmatch.filter(some.maps, pattern)
+        assert names or pattern == "mean"
+        assert all(some.maps[name].shape[axis] == kept for name in names)
+    points, enough = lookups(rng, whole, kind, chosen)
     assert 0.1 < enough.mean() < 0.9
     inside, outside = (tuple(a[mask] for a in points) for mask in (enough, ~enough))
     np.testing.assert_array_equal(some.evaluate(*inside), whole.evaluate(*inside))
@@ -55,9 +64,9 @@ def test_kept_views_give_the_same_numbers_and_others_none(need, fits, llvm, rng,
     assert np.isnan(probe(some, *outside)).all()
 
     mitsuba_plugins.register()
-    names = " ".join(map(str, views))
+    names = " ".join(map(str, chosen))
     parts = [
-        llvm.load_dict({"type": "btf", "filename": str(path), **more}) for more in ({}, {"views": names})
+        llvm.load_dict({"type": "btf", "filename": str(path), **more}) for more in ({}, {f"{kind}s": names})
     ]
     si = dr.zeros(llvm.SurfaceInteraction3f, len(points[0]))
     si.uv, si.wi = llvm.Point2f(points[0].T), llvm.Vector3f(points[2].T)

@@ -1,0 +1,136 @@
+"""Say what scenes need of a BTF: views, lights, texels, levels of detail, entries of its maps.
+
+One pass over the first hits of the camera's rays. Several scenes, and several values of a parameter (--sweep), need
+what any of them needs. With --views, --lights and --texels the BTF need not be there yet; `btfref synth --for` then
+traces what is needed alone.
+
+  btfref demand plane -D btf=checker.raw.exr
+  btfref demand turning --sweep turn=0,5,10,15 --views ubo81 --lights ubo81 --texels 64
+"""
+
+from __future__ import annotations
+
+from btfref.commands._shared import (
+    Progress,
+    assignments,
+    count,
+    direction_set,
+    emit,
+    emit_json,
+    number_above,
+    size,
+    table,
+)
+from btfref.errors import InputError
+
+
+def add_arguments(parser):
+    """Describe the command's arguments."""
+    parser.add_argument("scene", nargs="+", metavar="SCENE", help="scene files, or names of shipped scenes")
+    add_scene_arguments(parser)
+    parser.add_argument("--views", metavar="SET", help="of a BTF that is not there yet, as for synth")
+    parser.add_argument("--lights", metavar="SET", help="likewise (default: as the views)")
+    parser.add_argument("--texels", type=count(1), metavar="N", help="likewise, per side (default 64)")
+    parser.add_argument("--json", action="store_true", help="print numbers and indices as JSON")
+
+
+def add_scene_arguments(parser):
+    """What says how scenes are looked at: `synth --for` shares it."""
+    parser.add_argument(
+        "-D", dest="define", action="append", metavar="KEY=VALUE", help="parameter of the scenes"
+    )
+    parser.add_argument(
+        "--sweep",
+        action="append",
+        metavar="KEY=A,B,…",
+        help="parameter of the scenes, one picture for each value",
+    )
+    parser.add_argument(
+        "--grid", type=count(1), default=4, metavar="N", help="N × N rays a pixel (default 4)"
+    )
+    parser.add_argument("--size", type=size, metavar="WxH", help="of the images, in pixels")
+    parser.add_argument(
+        "--margin",
+        type=number_above(0),
+        metavar="RADIANS",
+        help="by which directions may be off (default: the angle of a pixel)",
+    )
+    parser.add_argument(
+        "--indirect", action="store_true", help="count what light may need that was reflected more than once"
+    )
+
+
+def run(args):
+    """Carry the command out."""
+    from btfref.demand import maps_needed
+
+    shape = None
+    if args.views or args.lights or args.texels:
+        shape = whole_shape(args.views or "ubo81", args.lights or args.views or "ubo81", args.texels or 64)
+    found = union(args, args.scene, shape)
+    if shape is None:
+        from btfref.representations import load
+
+        found = {name: maps_needed(one, load(name)) for name, one in found.items()}
+    if args.json:
+        emit_json(
+            {
+                name: {
+                    "shares": {what: {"needed": n, "of": m} for what, (n, m) in one.shares().items()},
+                    **{what: getattr(one, what).nonzero()[0].tolist() for what in ("views", "lights")},
+                    "least_lod": one.least_lod,
+                    "lookups": one.lookups,
+                }
+                for name, one in found.items()
+            }
+        )
+        return 0
+    for name, one in found.items():
+        emit(name)
+        rows = [(what, n, m, f"{100 * n / m:.3g} %") for what, (n, m) in one.shares().items()]
+        for line in table(rows, header=("what", "needed", "of", "share")):
+            emit(line)
+    return 0
+
+
+def whole_shape(views, lights, texels):
+    """Shape of a BTF that is not there yet, for :func:`btfref.demand.demand`."""
+    from btfref.numerics.directions import directions
+
+    return directions(direction_set(views)), directions(direction_set(lights)), (texels, texels)
+
+
+def union(args, scenes, shape):
+    """What all scenes and all values of swept parameters need, by BTF file.
+
+    Raises
+    ------
+    InputError
+        For scenes without a BTF, or parameters that cannot be read.
+    """
+    import itertools
+
+    from btfref.demand import demand
+    from btfref.scenes import scene_file
+
+    fixed = assignments(args.define, convert=str, option="-D")
+    swept = assignments(args.sweep, convert=lambda text: text.split(","), option="--sweep")
+    frames = [dict(zip(swept, values, strict=True)) for values in itertools.product(*swept.values())]
+    found = {}
+    with Progress() as progress:
+        for scene, frame in itertools.product(scenes, frames):
+            one = demand(
+                scene_file(scene),
+                parameters=fixed | frame,
+                grid=args.grid,
+                size=args.size,
+                margin=args.margin,
+                shape=shape,
+                indirect=args.indirect,
+                progress=progress,
+            )
+            for name, needed in one.items():
+                found[name] = found[name] | needed if name in found else needed
+    if not found:
+        raise InputError("no shape shows a BTF", file=" ".join(scenes), field="bsdf")
+    return found

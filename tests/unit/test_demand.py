@@ -1,0 +1,237 @@
+"""Demand: what scenes need, tracing and loading no more than that, and the same picture bit by bit."""
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+
+from btfref.cli import main
+from btfref.compare.tolerances import tolerance
+from btfref.demand import MARGIN, Demand, demand, maps_needed
+from btfref.errors import BtfrefError, InputError
+from btfref.numerics.directions import directions, spherical
+from btfref.render.realtime import realtime
+from btfref.render.reference import render
+from btfref.representations import load, raw, save
+from btfref.sampling import SampledBTF, open_store
+from btfref.sampling.part import Part
+from btfref.sampling.synthesis import synthesize_store
+from btfref.scenes import scene_file
+
+SIZE = (40, 40)
+PLANE = scene_file("plane")
+
+
+def shape(views="ubo81", lights="ubo81", texels=(16, 12)):
+    return directions(views), directions(lights), texels
+
+
+@pytest.fixture
+def one_light(fits):
+    return {"btf": str(fits.path("raw")), "lights": "directional1", "tiling": "3"}
+
+
+def test_one_light_needs_its_neighbours(need, one_light):
+    need("llvm")
+    (found,) = demand(PLANE, parameters=one_light, size=SIZE, grid=1, margin=MARGIN).values()
+    from btfref.render.scene import read_scene
+
+    (light,) = read_scene(PLANE, one_light).lights
+    index, weight = directions("ubo81").stencil(light.position)
+    assert set(index[weight > 0]) <= set(np.flatnonzero(found.lights))
+    assert found.lights.sum() <= 6
+    assert 3 <= found.views.sum() < 40
+    assert found.texels.all()
+    assert 0.3 * SIZE[0] * SIZE[1] < found.lookups <= SIZE[0] * SIZE[1]
+    # Pairs lie within what views and lights span.
+    assert not (found.pairs & ~(found.views[:, None] & found.lights[None])).any()
+    assert found.pairs.any(1).sum() <= found.views.sum()
+    needed, whole = found.shares()["samples"]
+    assert whole == 81 * 81 * 16 * 12
+    assert needed == found.views.sum() * found.lights.sum() * 16 * 12
+
+
+def brute_views(representation, parameters):
+    """Views with weight at the pixels' centres, from the geometry of a pinhole before the plane z = 0."""
+    from btfref.render.scene import read_scene
+
+    scene = read_scene(PLANE, parameters, size=SIZE)
+    corner, right, down = scene.camera.ray_basis()
+    y, x = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
+    ray = corner + x[..., None] * right + y[..., None] * down
+    t = -scene.camera.origin[2] / ray[..., 2]
+    hit = scene.camera.origin + t[..., None] * ray
+    inside = (np.abs(hit[..., :2]) < 0.999).all(-1) & (t > 0)
+    w = -ray[inside] / np.linalg.norm(ray[inside], axis=-1, keepdims=True)
+    index, weight = directions("ubo81").stencil(w)
+    return set(index[weight > 1e-6])
+
+
+def test_views_are_those_of_a_pinhole(need, fits, one_light):
+    need("llvm")
+    (found,) = demand(PLANE, parameters=one_light, size=SIZE, grid=1, margin=MARGIN).values()
+    expected = brute_views(fits("raw"), one_light)
+    assert expected <= set(np.flatnonzero(found.views))
+    assert len(found.views.nonzero()[0]) <= len(expected) + 4
+
+
+def test_margin_and_grid_only_add(need, one_light):
+    need("llvm")
+    found = [
+        next(iter(demand(PLANE, parameters=one_light, size=SIZE, grid=grid, margin=margin).values()))
+        for grid, margin in ((1, MARGIN), (1, 0.2), (2, 0.2))
+    ]
+    for small, large in itertools.pairwise(found):
+        for name in ("views", "lights", "texels"):
+            assert not (getattr(small, name) & ~getattr(large, name)).any()
+    assert found[1].views.sum() > found[0].views.sum()
+
+
+def test_environments_need_all_lights_and_bounces_all_views(need, one_light):
+    need("llvm")
+    (sky,) = demand(PLANE, parameters=one_light | {"lights": "constant"}, size=SIZE, grid=1).values()
+    assert sky.lights.all()
+    assert not sky.views.all()
+    (indirect,) = demand(PLANE, parameters=one_light, size=SIZE, grid=1, indirect=True).values()
+    assert indirect.lights.all()
+    assert indirect.views.all()
+
+
+def test_union_and_parts():
+    def some(views, lights, texels, lod=0.0):
+        masks = [np.zeros(n, bool) for n in (5, 4)]
+        masks[0][views], masks[1][lights] = True, True
+        there = np.zeros((100, 70), bool)
+        there[texels] = True
+        return Demand("x", *masks, masks[0][:, None] & masks[1], there, lod, 7)
+
+    one, two = some([1, 3], [0], (3, 3), 1.5), some([1], [2], (99, 69), 0.25)
+    both = one | two
+    assert both.views.nonzero()[0].tolist() == [1, 3]
+    assert both.lights.nonzero()[0].tolist() == [0, 2]
+    assert both.least_lod == 0.25
+    assert both.lookups == 14
+    assert one.part() == Part((1, 3), (0,), (0,))
+    assert both.part(64) == Part((1, 3), (0, 2), (0, 3))
+    assert both.tiles(32).sum() == 2
+    with pytest.raises(InputError, match="needs nothing"):
+        some([], [0], (0, 0)).part()
+    with pytest.raises(InputError, match="different shapes"):
+        one | Demand("y", *(np.zeros(3, bool),) * 2, np.zeros((3, 3), bool), np.zeros((2, 2), bool))
+
+
+def test_levels_and_entries(need, fits):
+    need("llvm")
+    for key in ("laplacian", "lpca"):
+        parameters = {"btf": str(fits.path(key)), "lights": "directional1", "tiling": "60"}
+        (found,) = demand(PLANE, parameters=parameters, size=SIZE, grid=1).values()
+        maps = maps_needed(found, fits(key)).maps
+        if key == "lpca":
+            used, whole = maps["entries of cluster"]
+            assert 1 <= used <= whole
+            continue
+        needed, whole = maps["levels"]
+        # 60 tiles of 16 x 12 texels on some 30 pixels: the finest levels are not looked up.
+        assert found.least_lod > 1
+        assert needed < whole
+        near = demand(PLANE, parameters=parameters | {"tiling": "0.2"}, size=SIZE, grid=1)
+        assert maps_needed(next(iter(near.values())), fits(key)).maps["levels"] == (whole, whole)
+
+
+def test_pictures_are_equal_bit_by_bit(need, fits, one_light):
+    """Reference and real-time picture from the needed maps alone, of methods that keep maps by both directions."""
+    need("llvm")
+    need("gl")
+    for key in ("raw", "lpca"):
+        parameters = one_light | {"btf": str(fits.path(key))}
+        whole = render(PLANE, parameters=parameters, noise_free=2, size=SIZE)
+        some = render(PLANE, parameters=parameters, noise_free=2, size=SIZE, maps="needed")
+        np.testing.assert_array_equal(some.image, whole.image)
+        (kept,) = some.meta["maps"].values()
+        assert kept["views"] < 40
+        assert kept["lights"] <= 6
+        assert some.meta["not_finite"] == 0
+    fast = [
+        realtime(PLANE, parameters=one_light, grid=1, size=SIZE, views=views) for views in ("all", "needed")
+    ]
+    np.testing.assert_array_equal(fast[0].image, fast[1].image)
+    assert max(fast[1].meta["resident_lights"].values()) <= 6
+
+
+def test_a_store_of_what_is_needed(need, tmp_path, one_light):
+    """Traced for one scene: the same samples, the same picture; another scene is an error and never a wrong value."""
+    need("llvm")
+    settings = {"texels": 8, "views": "ubo81", "lights": "ubo81", "spp": 2, "seed": 3, "max_depth": 3}
+    scene = one_light | {"btf": "not there yet.exr"}
+    (found,) = demand(PLANE, parameters=scene, size=SIZE, grid=2, shape=shape(texels=(8, 8))).values()
+    store = synthesize_store(tmp_path / "part.btf.zarr", "checker", only=found.part(), **settings)
+    whole = synthesize_store(tmp_path / "whole.btf.zarr", "checker", **settings)
+    assert store.coverage.mean() <= tolerance("demand.one_light.samples")
+    assert not store.complete
+    paths = {}
+    for name, made in (
+        ("part", raw.fit_partial(open_store(store.path))),
+        ("whole", raw.fit(SampledBTF.load(whole.path))),
+    ):
+        paths[name] = tmp_path / f"{name}.raw.exr"
+        save(made, paths[name])
+    assert paths["part"].stat().st_size <= tolerance("demand.one_light.bytes") * paths["whole"].stat().st_size
+    images = [
+        render(PLANE, parameters=one_light | {"btf": str(path)}, noise_free=2, size=SIZE).image
+        for path in paths.values()
+    ]
+    np.testing.assert_array_equal(images[0], images[1])
+    other = one_light | {"btf": str(paths["part"]), "lights": "directional3"}
+    assert render(PLANE, parameters=other, noise_free=1, size=SIZE).meta["not_finite"] > 100
+    with pytest.raises(BtfrefError, match="no numbers"):
+        render(PLANE, parameters=other, noise_free=1, size=SIZE, debug=True)
+    with pytest.raises(InputError, match="not resident"):
+        load(paths["part"]).evaluate([0.2, 0.3], spherical(1.2, 3.0), spherical(1.2, 3.0))
+
+
+def test_missing_tiles_are_no_numbers(need, tmp_path):
+    need("llvm")
+    settings = {"texels": (8, 70), "views": "10x5", "lights": [[0, 0, 1]], "spp": 2}
+    part = Part(views=tuple(range(15)), tiles=(1,))
+    store = synthesize_store(tmp_path / "part.btf.zarr", "checker", only=part, **settings)
+    made = raw.fit_partial(store)
+    save(made, tmp_path / "part.raw.exr")
+    again = load(tmp_path / "part.raw.exr")
+    assert np.isnan(again.maps["values"]).mean() == pytest.approx(64 / 70)
+    up, view = [0, 0, 1], store.views.vectors[1]
+    assert (again.evaluate([67.5 / 70, 0.3], up, view) > 0).any()
+    with pytest.raises(InputError, match="texels that are not resident"):
+        again.evaluate([20 / 70, 0.3], up, view)
+    with pytest.raises(InputError, match="not resident"):
+        again.evaluate([67.5 / 70, 0.3], up, store.views.vectors[40])
+    assert np.isfinite(again.sampling_tables()[1]).all()
+
+
+def test_commands(need, tmp_path, capsys, fits):
+    need("llvm")
+    btf = str(fits.path("lpca"))
+    assert main(["demand", "plane", f"-Dbtf={btf}", "--size", "16x16", "--grid", "1", "--json"]) == 0
+    (found,) = json.loads(capsys.readouterr().out).values()
+    assert set(found["shares"]) == {"views", "lights", "pairs", "texels", "samples", "entries of cluster"}
+    assert len(found["views"]) == found["shares"]["views"]["needed"]
+    words = ["demand", "turning", "--views", "10x5", "--size", "16x16", "--grid", "1", "--json"]
+    counts = []
+    for sweep in ("turn=0", "turn=0,40"):
+        assert main([*words, "--sweep", sweep]) == 0
+        (found,) = json.loads(capsys.readouterr().out).values()
+        counts.append(len(found["lights"]) + len(found["views"]))
+    assert counts[1] >= counts[0]
+    out = tmp_path / "part.btf.zarr"
+    words = ["synth", "checker", "-o", str(out), "--texels", "4", "--spp", "2", "--size", "16x16"]
+    assert main([*words, "--for", "plane"]) == 0
+    assert open_store(out).coverage.mean() < 0.05
+    assert main([*words, "--for", "plane", "--only-views", "0"]) == 2
+    assert main([*words, "--indirect"]) == 2
+    capsys.readouterr()
+    made = tmp_path / "part.raw.exr"
+    assert main(["fit", "raw", str(out), "--partial", "-o", str(made)]) == 0
+    assert main(["fit", "lpca", str(out), "--partial", "-o", str(tmp_path / "no.lpca.exr")]) == 2
+    assert "needs the whole BTF" in capsys.readouterr().err
+    words = ["render", "plane", "-o", str(tmp_path / "x.exr"), f"-Dbtf={made}", "--noise-free", "1"]
+    assert main([*words, "--size", "16x16", "--debug"]) == 0
