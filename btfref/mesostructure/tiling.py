@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from btfref.mesostructure.materials import load_bsdf
+from btfref.numerics.transfer import to_device
 
 
 def tile_group(mesostructure, bsdfs=None):
@@ -37,11 +36,11 @@ def tile_group(mesostructure, bsdfs=None):
         )
         uv = part.vertices[:, :2] if part.uv is None else part.uv
         values = mi.traverse(mesh)
-        values["vertex_positions"] = part.vertices.astype(np.float32).ravel()
-        values["faces"] = part.faces.ravel()
+        values["vertex_positions"] = to_device(mi.Float, part.vertices)
+        values["faces"] = to_device(mi.UInt32, part.faces)
         if part.normals is not None:
-            values["vertex_normals"] = np.asarray(part.normals, dtype=np.float32).ravel()
-        values["vertex_texcoords"] = np.asarray(uv, dtype=np.float32).ravel()
+            values["vertex_normals"] = to_device(mi.Float, part.normals)
+        values["vertex_texcoords"] = to_device(mi.Float, uv)
         values.update()
         group[f"part_{index}"] = mesh
     return mi.load_dict(group)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from btfref.numerics.transfer import to_device
+
 #: Of the directions that a vertex looks at, one in so many is traced; the others are looked up.
 SHARE = 8
 
@@ -33,12 +35,12 @@ class VisibilityCache:
 
         self.n = len(directions)
         self.share = 1 if bits is None else SHARE
-        self.bits = None if bits is None else mi.UInt8(np.ascontiguousarray(bits.T).ravel())
+        self.bits = None if bits is None else to_device(mi.UInt8, bits.T)
         part_start = np.zeros(max(lobes.ids) + 1, np.uint32)
         part_start[lobes.ids] = descent.part_start
-        self._part_start = mi.UInt32(part_start)
+        self._part_start = to_device(mi.UInt32, part_start)
         self._level, self._first, self._row = (
-            mi.UInt32(words) for words in (descent.level, descent.first, descent.row)
+            to_device(mi.UInt32, words) for words in (descent.level, descent.first, descent.row)
         )
         self._deepest = int(descent.level.max())
         # A direction's class depends on itself alone: parts of a BTF are traced as the whole is.
@@ -49,8 +51,8 @@ class VisibilityCache:
         classes = (mixed % np.uint64(self.share)).astype(np.int64)
         order = np.argsort(classes, kind="stable")
         starts = np.searchsorted(classes[order], np.arange(self.share + 1))
-        self._members, self._starts = mi.UInt32(order.astype(np.uint32)), mi.UInt32(starts.astype(np.uint32))
-        self.vectors = mi.Float(np.asarray(directions, np.float32).ravel())
+        self._members, self._starts = (to_device(mi.UInt32, words) for words in (order, starts))
+        self.vectors = to_device(mi.Float, directions)
 
     def row(self, hit, number):
         """Small triangle of preliminary intersections (`mitsuba.PreliminaryIntersection3f`)."""

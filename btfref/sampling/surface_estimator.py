@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 
+from btfref.numerics.transfer import to_device
 from btfref.sampling.lobes import BroadLobes
 from btfref.sampling.surface_cache import LARGEST, LEAST, VisibilityCache
 from btfref.sampling.surface_gather import gather
@@ -139,8 +140,7 @@ class SurfaceEstimator:
         if not len(directions) or not len(self.lit):
             return
         tiles = TiledScene(mesostructure, np.concatenate([views, lights]))
-        vectors = mi.Float(lights[self.lit].astype(np.float32).ravel())
-        lights = Lights(vectors, mi.UInt32(light_rows))
+        lights = Lights(to_device(mi.Float, lights[self.lit]), to_device(mi.UInt32, light_rows))
         self.scene = SurfaceScene(tiles, BroadLobes(tiles.bsdfs), directions, lights)
         self._place_points(mesostructure, views)
         self._see()
@@ -231,11 +231,11 @@ class SurfaceEstimator:
         direction = np.repeat(np.arange(len(rays)), [RAYS * len(some) for some in rays])
         half, texel, _ = (np.repeat(column, RAYS) for column in np.concatenate(rays).T)
         ray = np.tile(np.arange(RAYS), len(texel) // RAYS)
-        lane = mi.UInt32(lanes(self.scene.directions[direction], texel, 2 * ray + half))
+        lane = to_device(mi.UInt32, lanes(self.scene.directions[direction], texel, 2 * ray + half))
         u, v, choice, _ = uniforms(lane, stream_keys(self.seed, _RAYS), mi.UInt32(0))
-        x = (mi.Float(texel % self.texels[1]) + u) / self.texels[1]
-        y = (mi.Float(texel // self.texels[1]) + v) / self.texels[0]
-        w = mi.Vector3f(self.scene.directions[direction].T.astype(np.float32))
+        x = (to_device(mi.Float, texel % self.texels[1]) + u) / self.texels[1]
+        y = (to_device(mi.Float, texel // self.texels[1]) + v) / self.texels[0]
+        w = to_device(mi.Vector3f, self.scene.directions[direction].T)
         hit, place = self.scene.tiles.locate(dr.fma(w, START, mi.Point3f(x, y, 0)), -w)
         found = Surface.of_interaction(hit, self.scene.lobes)
         row = self.scene.cache.row(place, found.number)
@@ -254,7 +254,7 @@ class SurfaceEstimator:
         n_points, n_lit, cache = seen.shape[1], len(self.lit), self.scene.cache
         self.table = dr.zeros(mi.Float, len(self.stream) * n_lit * 4)
         lane = dr.arange(mi.UInt32, n_points * n_lit)
-        sees = dr.gather(mi.UInt8, mi.UInt8(seen.ravel()), lane % n_lit * n_points + lane // n_lit)
+        sees = dr.gather(mi.UInt8, to_device(mi.UInt8, seen), lane % n_lit * n_points + lane // n_lit)
         dr.scatter(self.table, mi.Float(sees), lane * 4 + 3)
         if sights is not None:
             lane = dr.arange(mi.UInt32, (len(self.stream) - n_points) * n_lit)
@@ -267,7 +267,6 @@ class SurfaceEstimator:
 
     def _walk_from_points(self):
         """Light by way of the broad lobe at the points: cosine-distributed walks, the same for all views."""
-        import drjit as dr
         import mitsuba as mi
 
         scene = self.scene
@@ -279,13 +278,12 @@ class SurfaceEstimator:
         if not len(start):
             return
         for k in range(self.broad_walks):
-            index = mi.UInt32(start.astype(np.uint32))
-            lane = mi.UInt32(self.stream[start])
+            index, lane = (to_device(mi.UInt32, words) for words in (start, self.stream[start]))
             keys = stream_keys(self.seed, _BROAD, k)
             u, v, _, _ = uniforms(lane, keys, mi.UInt32(0))
             si, _, number, rho = self.surface.interaction(index)
             local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(u, v))
-            weight = rho * lobes.shape(number, local.z) * dr.opaque(mi.Float, 1 / self.broad_walks)
+            weight = rho * lobes.shape(number, local.z)
             ray = si.spawn_ray(si.to_world(local))
             state = {
                 "lane": lane,
@@ -296,7 +294,7 @@ class SurfaceEstimator:
             }
             continue_walks(
                 scene.tiles, lobes, scene.cache, scene.lights, self.table, state, keys,
-                vertex=2, last=self.n_vertices, stride=4, broad_first=True,
+                vertex=2, last=self.n_vertices, stride=4, broad_first=True, count=self.broad_walks,
             )  # fmt: skip
 
     # --- results

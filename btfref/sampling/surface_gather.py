@@ -10,6 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from btfref.numerics.transfer import to_device
+from btfref.sampling.surface_points import starts
+
 #: Lights that one lane serves.
 LIGHTS_PER_LANE = 3
 
@@ -33,7 +36,7 @@ def gather(scene, surface, table, rows, bins, *, radiance, splats, texels):
     radiance : mitsuba.Float
         Light by way of the rest, [view, half, texel, light, 3].
     splats : tuple of mitsuba.Float, or None
-        Sums and sums of squares of photons, [view, texel, light, 3].
+        Sums and sums of squares of photons, [view, light, texel, 3].
     texels : tuple of int
 
     Returns
@@ -56,7 +59,7 @@ def gather(scene, surface, table, rows, bins, *, radiance, splats, texels):
     n_blocks = -(-n_lit // LIGHTS_PER_LANE)
     halves = np.stack([some.totals() for some in bins])  # view, half, texel
     lean = 0.5 * (halves[:, 0] - halves[:, 1])
-    share = mi.Float((0.5 + lean).astype(np.float32).ravel())
+    share = to_device(mi.Float, 0.5 + lean)
 
     lane = dr.arange(mi.UInt32, len(rows) * n_texels * n_blocks)
     cell, first = lane // n_blocks, (lane % n_blocks) * LIGHTS_PER_LANE
@@ -80,7 +83,7 @@ def gather(scene, surface, table, rows, bins, *, radiance, splats, texels):
             scale = 2 * (dr.square(mine) + dr.square(1 - mine))
             noise += scale * dr.gather(mi.Color3f, pooled, block * n_lit + light, inside)
         if splats is not None:
-            at = cell * n_lit + light
+            at = (view * n_lit + light) * n_texels + texel
             value += dr.gather(mi.Color3f, splats[0], at, inside)
             noise += dr.gather(mi.Color3f, splats[1], at, inside)
         at = ((view * n_lit + light) * n_texels + texel) * 3
@@ -120,9 +123,9 @@ def _packets(scene, surface, rows, bins):
     import drjit as dr
     import mitsuba as mi
 
-    record = mi.UInt32(np.concatenate([some.record for some in bins]))
+    record = to_device(mi.UInt32, np.concatenate([some.record for some in bins]))
     row = np.repeat(np.asarray(rows, np.uint32), [len(some.record) for some in bins])
-    w = dr.gather(mi.Vector3f, scene.cache.vectors, mi.UInt32(row))
+    w = dr.gather(mi.Vector3f, scene.cache.vectors, to_device(mi.UInt32, row))
     number = dr.gather(mi.UInt32, surface.number, record)
     shading, s = (dr.gather(mi.Vector3f, a, record) for a in (surface.shading, surface.s))
     wi = mi.Frame3f(s, dr.cross(shading, s), mi.Normal3f(shading)).to_local(w)
@@ -130,11 +133,10 @@ def _packets(scene, surface, rows, bins):
     weight, half = (np.concatenate([getattr(some, name) for some in bins]) for name in ("weight", "half"))
     lane = dr.arange(mi.UInt32, len(weight))
     packets = dr.zeros(mi.Float, 16 * len(weight))
-    whole = (mi.Float(dr.reinterpret_array(mi.Float, a)) for a in (number, record))
-    numbers, records = whole
+    numbers, records = (mi.Float(dr.reinterpret_array(mi.Float, a)) for a in (number, record))
     values = (
         *s, uv.x, *shading, uv.y, *wi, scene.lobes.shape(number, wi.z),
-        mi.Float(weight), numbers, records, mi.Float(half.astype(np.float32)),
+        to_device(mi.Float, weight), numbers, records, to_device(mi.Float, half),
     )  # fmt: skip
     for k, value in enumerate(values):
         dr.scatter(packets, value, lane * 16 + k)
@@ -152,12 +154,11 @@ def _points(scene, surface, table, rows, bins, n_texels):
     n_blocks = -(-n_lit // block)
     lane = dr.arange(mi.UInt32, len(rows) * n_texels * n_blocks)
     cell, first = lane // n_blocks, (lane % n_blocks) * block
-    offsets = np.cumsum([0, *(len(some.record) for some in bins)])
-    starts = np.concatenate([some.start[:-1] + np.uint32(k) for some, k in zip(bins, offsets, strict=False)])
-    start = mi.UInt32(np.append(starts, offsets[-1]).astype(np.uint32))
+    start = starts(bins)
+    n_entries, start = int(start[-1]), to_device(mi.UInt32, start)
     begin, end = dr.gather(mi.UInt32, start, cell), dr.gather(mi.UInt32, start, cell + 1)
     zero = dr.zeros(mi.Float, dr.width(lane))
-    if offsets[-1] == 0:
+    if n_entries == 0:
         return [[mi.Color3f(zero) for _ in range(block)] for _ in range(2)]
     packets = _packets(scene, surface, rows, bins)
     index = [dr.minimum(first + j, n_lit - 1) for j in range(block)]

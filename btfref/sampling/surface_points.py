@@ -143,17 +143,12 @@ class Bins:
             self.texel + n_texels * self.half.astype(np.int64), self.weight, 2 * n_texels
         ).reshape(2, -1)
 
-    def choose(self, half, texel, u):
-        """One entry of a half for each given texel, drawn by weight with numbers u in [0, 1); −1 for none."""
-        mine = np.flatnonzero(self.half == half)
-        total = np.concatenate([[0.0], np.cumsum(self.weight[mine], dtype=np.float64)])
-        begin = np.searchsorted(mine, self.start)
-        first, last = begin[texel], begin[texel + 1] - 1
-        low, high = total[first], total[last + 1]
-        entry = np.searchsorted(total, low + u * (high - low), side="right") - 1
-        entry = np.clip(entry, first, np.maximum(last, first))
-        empty = (last < first) | (high <= low)
-        return np.where(empty, -1, mine[np.minimum(entry, len(mine) - 1)] if len(mine) else -1)
+
+def starts(bins):
+    """Where the entries of several bins, one after the other, begin: (len(bins) · texels + 1,) uint32."""
+    offsets = np.cumsum([0, *(len(some.record) for some in bins)])
+    parts = [some.start[:-1] + np.uint32(k) for some, k in zip(bins, offsets, strict=False)]
+    return np.append(np.concatenate(parts), offsets[-1]).astype(np.uint32)
 
 
 def footprints(points, visible, w, texels):

@@ -9,13 +9,21 @@ from __future__ import annotations
 
 import numpy as np
 
+from btfref.numerics.transfer import to_device
+from btfref.sampling.surface_points import starts
 from btfref.sampling.surface_walks import Surface, connect, continue_walks
 from btfref.sampling.tiled_scene import stream_keys, uniforms
 
 #: Walks that start together: a bound on memory, without influence on the result.
 TOGETHER = 1 << 20
 
-_REST = 3
+_REST, _NONE = 3, 0xFFFFFFFF
+
+#: Random streams of a texel; beyond them neighbours share numbers.
+STREAMS = 1024
+
+#: Lanes that Dr.Jit's LLVM backend gives to one thread at a time.
+BLOCK = 1 << 14
 
 
 def lanes(directions, texel, sample):
@@ -30,10 +38,59 @@ def lanes(directions, texel, sample):
     -------
     ndarray (k,) uint32
     """
+    lane = stream_numbers(directions).astype(np.int64) + texel * STREAMS + sample
+    return (lane % (1 << 32)).astype(np.uint32)
+
+
+def stream_numbers(directions):
+    """First random stream of each direction: ndarray (k,) uint32."""
     bits = np.round(directions * 1e6).astype(np.int64) @ np.array([73856093, 19349663, 83492791])
-    key = (bits % (1 << 32)).astype(np.uint64)
-    lane = key * np.uint64(2654435761) + texel.astype(np.uint64) * np.uint64(64) + sample.astype(np.uint64)
-    return (lane % np.uint64(1 << 32)).astype(np.uint32)
+    return (bits.astype(np.uint64) * np.uint64(2654435761) % np.uint64(1 << 32)).astype(np.uint32)
+
+
+def _choose(bins, cell, half, u):
+    """One entry of a half for each of some cells, drawn by weight.
+
+    Parameters
+    ----------
+    bins : list of Bins
+    cell : mitsuba.UInt32
+        Number of the bin times texels, plus the texel.
+    half : mitsuba.UInt32
+    u : mitsuba.Float
+        Random numbers in [0, 1).
+
+    Returns
+    -------
+    entry : mitsuba.UInt32
+    found : mitsuba.Bool
+        False where the half has none.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    weight = to_device(mi.Float, np.concatenate([some.weight for some in bins]))
+    halves = to_device(mi.UInt8, np.concatenate([some.half for some in bins]))
+    start = to_device(mi.UInt32, starts(bins))
+    begin, end = dr.gather(mi.UInt32, start, cell), dr.gather(mi.UInt32, start, cell + 1)
+
+    def share(i):
+        mine = mi.UInt32(dr.gather(mi.UInt8, halves, i)) == half
+        return dr.select(mine, dr.gather(mi.Float, weight, i), 0)
+
+    state = (begin, dr.zeros(mi.Float, dr.width(cell)))
+    _, total = dr.while_loop(state, lambda i, _: i < end, lambda i, total: (i + 1, total + share(i)))
+    target = u * total
+    dr.eval(target)
+
+    def look(i, below, found):
+        some = share(i)
+        return i + 1, below + some, dr.select((some > 0) & (below <= target), i, found)
+
+    state = (begin, dr.zeros(mi.Float, dr.width(cell)), dr.full(mi.UInt32, _NONE, dr.width(cell)))
+    found = dr.while_loop(state, lambda i, below, found: i < end, look)[2]
+    dr.eval(found)
+    return found, found != _NONE
 
 
 class TexelWalks:
@@ -73,29 +130,22 @@ class TexelWalks:
         import mitsuba as mi
 
         scene, lobes = self.scene, self.scene.lobes
-        shape = (len(bins), 2, self.per_half, self.n_texels)
-        place, half, sample, texel = (a.ravel() for a in np.indices(shape, np.int32))
-        direction = place + first
-        lane = mi.UInt32(lanes(scene.directions[direction], texel, 2 * sample + half))
+        # Lanes: [direction, half, sample, texel].
+        lane = dr.arange(mi.UInt32, len(bins) * 2 * self.per_half * self.n_texels)
+        n_texels, per_half = (dr.opaque(mi.UInt32, n) for n in (self.n_texels, self.per_half))
+        texel, rest = lane % n_texels, lane // n_texels
+        sample, half, place = rest % per_half, rest // per_half % 2, rest // (2 * per_half)
+        direction = place + dr.opaque(mi.UInt32, first)
+        key = dr.gather(mi.UInt32, to_device(mi.UInt32, stream_numbers(scene.directions)), direction)
+        stream = key + texel * STREAMS + 2 * sample + half
         keys = stream_keys(self.seed, _REST)
-        pick, _, _, _ = uniforms(lane, keys, mi.UInt32(0))
-        pick = ((sample + pick.numpy().astype(np.float64)) / self.per_half).reshape(shape)
-        record, flux = np.full(shape, -1, np.int64), np.zeros(shape, np.float32)
-        every = np.tile(np.arange(self.n_texels), self.per_half)
-        for k, some in enumerate(bins):
-            if not len(some.record):
-                continue
-            for h in range(2):
-                entry = some.choose(h, every, pick[k, h].ravel()).reshape(shape[2:])
-                record[k, h] = np.where(entry >= 0, some.record[np.maximum(entry, 0)], -1)
-                flux[k, h] = np.where(entry >= 0, some.flux[np.maximum(entry, 0)], 0)
-        record = record.ravel()
-        lobe, u, v, choice = uniforms(lane, keys, mi.UInt32(1))
-        valid = mi.Bool(record >= 0)
-        w = mi.Vector3f(scene.directions[direction].T.astype(np.float32))
-        si, bsdf, number, albedo = surface.interaction(
-            mi.UInt32(np.maximum(record, 0).astype(np.uint32)), valid
-        )
+        pick, _, _, _ = uniforms(stream, keys, mi.UInt32(0))
+        entry, valid = _choose(bins, place * n_texels + texel, half, (mi.Float(sample) + pick) / per_half)
+        record = to_device(mi.UInt32, np.concatenate([some.record for some in bins]))
+        flux = to_device(mi.Float, np.concatenate([some.flux for some in bins]))
+        lobe, u, v, choice = uniforms(stream, keys, mi.UInt32(1))
+        w = dr.gather(mi.Vector3f, scene.cache.vectors, direction)
+        si, bsdf, number, albedo = surface.interaction(dr.gather(mi.UInt32, record, entry, valid), valid)
         si.wi = si.to_local(w)
         drawn, weight = lobes.sample_rest(bsdf, number, albedo, si, lobe, mi.Point2f(u, v), valid)
         active = valid & (dr.max(dr.abs(weight)) > 0)
@@ -106,18 +156,18 @@ class TexelWalks:
         back.wi = drawn.wo
         power = lobes.eval_rest(bsdf, number, albedo, back, si.to_local(w), active)
         power *= dr.abs(dr.dot(si.n, ray.d)) / (dr.abs(dr.dot(si.n, w)) * drawn.pdf)
-        power = dr.select(active & (drawn.pdf > 0), power * mi.Float(flux.ravel()), 0)
-        state = [mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Color3f(power), mi.Color3f(weight), lane, choice]
+        power = dr.select(active & (drawn.pdf > 0), power * dr.gather(mi.Float, flux, entry, valid), 0)
+        state = [mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Color3f(power), mi.Color3f(weight), stream, choice]
         dr.eval(state, active)
         alive = dr.compress(active)
         if dr.width(alive) == 0:
             return None
-        origin, towards, power, weight, lane, choice = (dr.gather(type(a), a, alive) for a in state)
+        origin, towards, power, weight, stream, choice = (dr.gather(type(a), a, alive) for a in state)
         hit, found = scene.tiles.locate(origin, towards)
         surface = Surface.of_interaction(hit, lobes)
         row = scene.cache.row(found, surface.number)
         reached = hit.is_valid()
-        dr.eval(row, reached, towards, power, weight, lane, choice)
+        dr.eval(row, reached, towards, power, weight, stream, choice)
         there = dr.compress(reached)
         if dr.width(there) == 0:
             return None
@@ -127,15 +177,17 @@ class TexelWalks:
                 ("row", row),
                 ("weight", weight),
                 ("power", power),
-                ("lane", lane),
+                ("lane", stream),
                 ("choice", choice),
             )
         }
         gathered["wi"] = -dr.gather(mi.Vector3f, towards, there)
         dr.eval(gathered)
         which = dr.gather(mi.UInt32, alive, there).numpy()
-        numbers = {"direction": direction[which], "half": half[which], "sample": sample[which]}
-        return gathered | numbers | {"texel": texel[which], "surface": surface.taken(there)}
+        which, texel = np.divmod(which.astype(np.int64), self.n_texels)
+        which, sample = np.divmod(which, self.per_half)
+        numbers = {"direction": first + which // 2, "half": which % 2, "sample": sample, "texel": texel}
+        return gathered | numbers | {"surface": surface.taken(there)}
 
     def _look(self):
         """Visibility of the hits, and the power of the photons but for what depends on the view."""
@@ -147,11 +199,14 @@ class TexelWalks:
         si, _, number, albedo = surface.interaction(None)
         hits["coded"] = scene.cache.sights(scene.tiles, si, hits["row"], hits["choice"], towards=incoming)
         cosine = dr.dot(surface.shading, incoming)
-        z = mi.Float(scene.directions[hits["direction"], 2])
+        z = to_device(mi.Float, scene.directions[hits["direction"], 2])
         power = hits["power"] * albedo * scene.lobes.shape(number, cosine) * dr.maximum(cosine, 0)
         power *= dr.inv_pi * z / (dr.abs(dr.dot(surface.n, incoming)) * 2 * self.per_half)
         hits["power"] = mi.Color3f(power)
-        dr.eval(hits["power"])
+        bright = dr.max(dr.abs(hits["power"])) > 0
+        self.photons = dr.compress(bright)
+        first = np.searchsorted(self.photons.numpy(), self.range)
+        self.photon_range = to_device(mi.UInt32, first)
 
     def radiance(self, rows):
         """Light by way of the rest for some directions: [direction, half, texel, light, 3]."""
@@ -180,17 +235,16 @@ class TexelWalks:
         scene, lights, hits = self.scene, self.scene.lights, self.hits
         lobes, cache = scene.lobes, scene.cache
         slot = (place * 2 + hits["half"][index]) * self.n_texels + hits["texel"][index]
-        offset = mi.UInt32((slot * (3 * lights.count)).astype(np.uint32))
-        at = mi.UInt32(index.astype(np.uint32))
+        offset, at = to_device(mi.UInt32, slot * (3 * lights.count)), to_device(mi.UInt32, index)
         si, bsdf, number, albedo = hits["surface"].interaction(at)
         si.wi = si.to_local(dr.gather(mi.Vector3f, hits["wi"], at))
-        weight = dr.gather(mi.Color3f, hits["weight"], at) * dr.opaque(mi.Float, 1 / self.per_half)
+        weight, share = dr.gather(mi.Color3f, hits["weight"], at), dr.opaque(mi.Float, 1 / self.per_half)
         n, coded = dr.opaque(mi.UInt32, cache.n), hits["coded"]
 
         def sees(k):
             return cache.value(dr.gather(mi.UInt8, coded, dr.fma(at, n, k)))
 
-        connect(lobes, lights, target, (si, bsdf, number, albedo, weight), offset, sees, stride=3)
+        connect(lobes, lights, target, (si, bsdf, number, albedo, share * weight), offset, sees, stride=3)
         if self.n_vertices < 3:
             return
         keys = stream_keys(self.seed, _REST)
@@ -207,7 +261,7 @@ class TexelWalks:
         }
         continue_walks(
             scene.tiles, lobes, cache, lights, target, state, keys,
-            vertex=3, last=self.n_vertices, stride=3, broad_first=False,
+            vertex=3, last=self.n_vertices, stride=3, broad_first=False, count=self.per_half,
         )  # fmt: skip
 
     def splatted(self, rows, texels):
@@ -216,7 +270,7 @@ class TexelWalks:
         Returns
         -------
         tuple of mitsuba.Float
-            [direction, texel, light, 3] each.
+            [direction, light, texel, 3] each.
         """
         import drjit as dr
         import mitsuba as mi
@@ -228,18 +282,25 @@ class TexelWalks:
         if hits is None or not scene.lobes.any:
             return sums, squares
         surface, cache = hits["surface"], scene.cache
-        lane = dr.arange(mi.UInt32, n_lit * len(rows))
+        # A lane is a light and a view. Few as they are, they are spread so that every thread gets its share.
+        each = -(-n_lit * len(rows) // dr.thread_count())
+        lane = dr.arange(mi.UInt32, max(BLOCK, each) * dr.thread_count())
+        lane = lane // max(BLOCK, each) * each + lane % max(BLOCK, each)
+        busy = (dr.arange(mi.UInt32, dr.width(lane)) % max(BLOCK, each) < each) & (lane < n_lit * len(rows))
+        lane = dr.select(busy, lane, 0)
         n_rows = dr.opaque(mi.UInt32, len(rows))
         light, place = lane // n_rows, lane % n_rows
-        row = dr.gather(mi.UInt32, mi.UInt32(np.asarray(rows, np.uint32)), place)
+        row = dr.gather(mi.UInt32, to_device(mi.UInt32, rows), place)
         w = dr.gather(mi.Vector3f, cache.vectors, row)
-        bounds, own = mi.UInt32(self.range.astype(np.uint32)), dr.gather(mi.UInt32, lights.rows, light)
-        begin, end = dr.gather(mi.UInt32, bounds, own), dr.gather(mi.UInt32, bounds, own + 1)
+        own = dr.gather(mi.UInt32, lights.rows, light)
+        begin = dr.gather(mi.UInt32, self.photon_range, own)
+        end = dr.select(busy, dr.gather(mi.UInt32, self.photon_range, own + 1), 0)
         height, width = texels
-        base = place * (self.n_texels * n_lit) + light
+        base = (place * n_lit + light) * self.n_texels
         n = dr.opaque(mi.UInt32, cache.n)
 
-        def step(i):
+        def step(entry):
+            i = dr.gather(mi.UInt32, self.photons, entry)
             seen = cache.value(dr.gather(mi.UInt8, hits["coded"], dr.fma(i, n, row)))
             number = dr.gather(mi.UInt32, surface.number, i)
             shape = scene.lobes.shape(number, dr.dot(dr.gather(mi.Vector3f, surface.shading, i), w))
@@ -249,15 +310,15 @@ class TexelWalks:
             x, y = p.x - p.z * w.x / w.z, p.y - p.z * w.y / w.z
             column = dr.minimum(mi.UInt32((x - dr.floor(x)) * width), width - 1)
             line = dr.minimum(mi.UInt32((y - dr.floor(y)) * height), height - 1)
-            at = 3 * dr.fma(line * width + column, n_lit, base)
+            at = 3 * (line * width + column + base)
             bright = dr.max(dr.abs(value)) > 0
             for channel in range(3):
                 # A lane has one view and one light: its entries are its own, its order that of the photons.
                 for target, term in ((sums, value[channel]), (squares, dr.square(value[channel]))):
                     dr.scatter_add(target, term, at + channel, bright, mode=dr.ReduceMode.NoConflicts)
-            return (i + 1,)
+            return (entry + 1,)
 
-        dr.while_loop((begin,), lambda i: i < end, step)
+        dr.while_loop((begin,), lambda entry: entry < end, step)
         dr.eval(sums, squares)
         return sums, squares
 

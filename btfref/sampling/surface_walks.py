@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from btfref.numerics.transfer import to_device
 from btfref.sampling.path_estimator import ROULETTE_LIMIT, ROULETTE_VERTEX
 from btfref.sampling.tiled_scene import uniforms
 
@@ -43,12 +44,12 @@ class Surface:
 
         ids = np.array([*lobes.ids, 0], np.uint32)  # the absorber's part is −1
         place = cls(
-            mi.Point3f(points.p.T),
-            mi.Vector3f(points.n.T),
-            mi.Vector3f(points.s.T),
-            mi.Vector3f(points.shading.T),
-            mi.Point2f(points.uv.T),
-            mi.UInt32(ids[points.part]),
+            to_device(mi.Point3f, points.p.T),
+            to_device(mi.Vector3f, points.n.T),
+            to_device(mi.Vector3f, points.s.T),
+            to_device(mi.Vector3f, points.shading.T),
+            to_device(mi.Point2f, points.uv.T),
+            to_device(mi.UInt32, ids[points.part]),
             mi.Color3f(0),
         )
         return place._finished(lobes)
@@ -139,7 +140,7 @@ def visibility(tiles, surface, directions, *, front_only=False):
 
     n_records, n_directions = dr.width(surface.number), len(directions)
     result = dr.zeros(mi.UInt8, n_records * n_directions)
-    vectors = mi.Float(np.asarray(directions, np.float32).ravel())
+    vectors = to_device(mi.Float, np.asarray(directions))
     count, records = dr.opaque(mi.UInt32, n_directions), dr.opaque(mi.UInt32, n_records)
     lane = dr.arange(mi.UInt32, n_records)
     si = dr.zeros(mi.SurfaceInteraction3f, n_records)
@@ -221,7 +222,9 @@ def connect(lobes, lights, target, vertex, offset, sees, *, stride, broad=False)
     dr.eval(target)
 
 
-def continue_walks(tiles, lobes, cache, lights, target, state, keys, *, vertex, last, stride, broad_first):
+def continue_walks(
+    tiles, lobes, cache, lights, target, state, keys, *, vertex, last, stride, broad_first, count
+):
     """Follow walks from their first ray to the last vertex, connecting each vertex to all lights.
 
     Parameters
@@ -234,10 +237,14 @@ def continue_walks(tiles, lobes, cache, lights, target, state, keys, *, vertex, 
         Number of the next vertex of the path (the visible point is 1), and of the last one.
     broad_first : bool
         At the first vertex connect by the broad lobe only: photons bring the rest.
+    count : int
+        Walks that share a target. It divides what they bring and not their weights: roulette must not end a
+        walk because there are many.
     """
     import drjit as dr
     import mitsuba as mi
 
+    share = dr.opaque(mi.Float, 1 / count)
     names = ("lane", "target", "origin", "direction", "weight")
     values = [state[name] for name in names]
     alive = dr.max(dr.abs(values[4])) > 0
@@ -287,7 +294,7 @@ def continue_walks(tiles, lobes, cache, lights, target, state, keys, *, vertex, 
             lobes,
             lights,
             target,
-            (si, bsdf, number, albedo, weight),
+            (si, bsdf, number, albedo, share * weight),
             offset,
             sees,
             stride=stride,

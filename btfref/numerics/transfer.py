@@ -1,0 +1,40 @@
+"""From NumPy to Dr.Jit, always at the same alignment."""
+
+from __future__ import annotations
+
+import numpy as np
+
+#: What Dr.Jit aligns its own arrays to, bytes.
+ALIGNMENT = 64
+
+
+def to_device(kind, array):
+    """A Dr.Jit array with a copy of a NumPy array.
+
+    Dr.Jit's LLVM backend takes the memory of a NumPy array as it is, and compiles kernels anew for memory
+    that is aligned differently: which of two kernels is needed would depend on what ``malloc`` happened to
+    return.
+
+    Parameters
+    ----------
+    kind : type
+        Dr.Jit array type; a static vector type wants its components as rows.
+    array : array_like, shape (n,) or (k, n)
+        Converted to the type's kind of number.
+
+    Returns
+    -------
+    kind
+    """
+    import drjit as dr
+
+    array = np.asarray(array)
+    if dr.depth_v(kind) > 1:
+        return kind(*(to_device(dr.value_t(kind), row) for row in array))
+    numbers = {dr.VarType.UInt8: np.uint8, dr.VarType.UInt32: np.uint32, dr.VarType.Float32: np.float32}
+    dtype = np.dtype(numbers[dr.type_v(kind)])
+    memory = np.zeros(array.size * dtype.itemsize + ALIGNMENT, np.uint8)
+    first = -memory.ctypes.data % ALIGNMENT
+    aligned = memory[first : first + array.size * dtype.itemsize].view(dtype)
+    aligned[:] = array.ravel()
+    return kind(aligned)
