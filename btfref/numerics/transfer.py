@@ -38,3 +38,27 @@ def to_device(kind, array):
     aligned = memory[first : first + array.size * dtype.itemsize].view(dtype)
     aligned[:] = array.ravel()
     return kind(aligned)
+
+
+def in_one_kernel(width, scatters):
+    """Run several scatters to the same array as one kernel.
+
+    Dr.Jit evaluates an array with a pending scatter before the next one to it, and each of these kernels
+    computes anew all that the scatters have in common. Inside a symbolic loop, here of one round, it does not.
+
+    Parameters
+    ----------
+    width : int
+        Number of lanes.
+    scatters : callable
+        Without arguments; what it captures must be of that width, or single numbers.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    def step(k):
+        scatters()
+        return (k + 1,)
+
+    once = dr.opaque(mi.UInt32, 1)
+    dr.while_loop((dr.zeros(mi.UInt32, width),), lambda k: k < once, step)

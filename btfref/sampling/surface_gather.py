@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.numerics.transfer import to_device
+from btfref.numerics.transfer import in_one_kernel, to_device
 from btfref.sampling.surface_points import starts
 
 #: Lights that one lane serves.
@@ -70,26 +70,30 @@ def gather(scene, surface, table, rows, bins, *, radiance, splats, texels):
         pooled = _pooled(radiance, len(rows), texels, n_lit)
         block = (texel // texels[1] // 2) * ((texels[1] + 1) // 2) + texel % texels[1] // 2
         block += view * (((texels[0] + 1) // 2) * ((texels[1] + 1) // 2))
-    for j in range(LIGHTS_PER_LANE):
-        light = first + j
-        inside = light < n_lit
-        value, noise = points[j], spread[j]
-        if radiance is not None:
-            at = (2 * view * n_texels + texel) * n_lit + light
-            one = dr.gather(mi.Color3f, radiance, at, inside)
-            other = dr.gather(mi.Color3f, radiance, at + n_texels * n_lit, inside)
-            value += mine * one + (1 - mine) * other
-            # The halves' shares are mine and 1 − mine, the pooled number is for ½ and ½.
-            scale = 2 * (dr.square(mine) + dr.square(1 - mine))
-            noise += scale * dr.gather(mi.Color3f, pooled, block * n_lit + light, inside)
-        if splats is not None:
-            at = (view * n_lit + light) * n_texels + texel
-            value += dr.gather(mi.Color3f, splats[0], at, inside)
-            noise += dr.gather(mi.Color3f, splats[1], at, inside)
-        at = ((view * n_lit + light) * n_texels + texel) * 3
-        for channel in range(3):
-            dr.scatter(mean, value[channel], at + channel, inside)
-            dr.scatter(variance, noise[channel], at + channel, inside)
+
+    def write():
+        for j in range(LIGHTS_PER_LANE):
+            light = first + j
+            inside = light < n_lit
+            value, noise = points[j], spread[j]
+            if radiance is not None:
+                at = (2 * view * n_texels + texel) * n_lit + light
+                one = dr.gather(mi.Color3f, radiance, at, inside)
+                other = dr.gather(mi.Color3f, radiance, at + n_texels * n_lit, inside)
+                value += mine * one + (1 - mine) * other
+                # The halves' shares are mine and 1 − mine, the pooled number is for ½ and ½.
+                scale = 2 * (dr.square(mine) + dr.square(1 - mine))
+                noise += scale * dr.gather(mi.Color3f, pooled, block * n_lit + light, inside)
+            if splats is not None:
+                at = (view * n_lit + light) * n_texels + texel
+                value += dr.gather(mi.Color3f, splats[0], at, inside)
+                noise += dr.gather(mi.Color3f, splats[1], at, inside)
+            at = ((view * n_lit + light) * n_texels + texel) * 3
+            for channel in range(3):
+                dr.scatter(mean, value[channel], at + channel, inside)
+                dr.scatter(variance, noise[channel], at + channel, inside)
+
+    in_one_kernel(dr.width(lane), write)
     dr.eval(mean, variance)
     return mean.numpy().reshape(shape), variance.numpy().reshape(shape)
 
@@ -112,8 +116,12 @@ def _pooled(radiance, n_views, texels, n_lit):
             one = dr.gather(mi.Color3f, radiance, at)
             total += dr.square(one - dr.gather(mi.Color3f, radiance, at + n_texels * n_lit))
     result = dr.zeros(mi.Float, 3 * dr.width(lane))
-    for channel in range(3):
-        dr.scatter(result, total[channel] / 16, 3 * lane + channel)
+
+    def write():
+        for channel in range(3):
+            dr.scatter(result, total[channel] / 16, 3 * lane + channel)
+
+    in_one_kernel(dr.width(lane), write)
     dr.eval(result)
     return result
 
@@ -138,8 +146,12 @@ def _packets(scene, surface, rows, bins):
         *s, uv.x, *shading, uv.y, *wi, scene.lobes.shape(number, wi.z),
         to_device(mi.Float, weight), numbers, records, to_device(mi.Float, half),
     )  # fmt: skip
-    for k, value in enumerate(values):
-        dr.scatter(packets, value, lane * 16 + k)
+
+    def write():
+        for k, value in enumerate(values):
+            dr.scatter(packets, value, lane * 16 + k)
+
+    in_one_kernel(len(weight), write)
     dr.eval(packets)
     return packets
 
@@ -219,5 +231,4 @@ def _points(scene, surface, table, rows, bins, n_texels):
     spread = [
         scale * dr.maximum(dd[j] - 2 * slopes[j] * dx[j] + dr.square(slopes[j]) * dw, 0) for j in range(block)
     ]
-    dr.eval(means, spread)
     return means, spread
