@@ -19,6 +19,7 @@ from btfref.registry import method
 from mitsuba_plugins.footprint import LevelOfDetail
 from mitsuba_plugins.guide import LightGuide
 from mitsuba_plugins.lookup import direction_table, tensor, valid_directions
+from mitsuba_plugins.proposals import Guided, Mixture
 
 
 class Maps:
@@ -88,7 +89,9 @@ def make_bsdf():
         filter_type string   "bilinear" or "nearest"; default: what the file says
         scale      float     factor of the reflectance, ≥ 0; default 1
         to_uv      transform of the texture coordinates; its rotation also turns the local frame
-        sampling   string    "data" (default): light directions by the data; "cosine": by the cosine, for comparison
+        sampling   string    what proposes light directions: "data", tables of the data; "lobes", the method's own lobes
+                             or microfacets; "both", half of each; "cosine", for comparison. Default: what has the least
+                             variance for its time, "data" for a method without lobes
         views      string    indices of the measured views to keep, such as "0 3 17"; default: all. A lookup that needs
                              another one gives no number
         lights     string    likewise of the lights
@@ -117,7 +120,6 @@ def make_bsdf():
             )
             own = representation.meta["filter_type"]
             self.filter_type = _choice(props, "filter_type", own, FILTER_TYPES)
-            sampling = _choice(props, "sampling", "data", ("data", "cosine"))
             self.scale = mi.Float(_number(props, "scale", 1.0, least=0.0))
             affine, self.rotation = uv_transform(_matrix(_parameter(props, "to_uv", None)))
             # Python floats: NumPy scalars would try to read a symbolic operand.
@@ -126,7 +128,10 @@ def make_bsdf():
             self.maps = Maps(representation, self.filter_type)
             self.evaluator = import_module(method(self.key).plugin).Evaluator(self.maps)
             self.detail = self._level_of_detail(props)
-            self.guide = LightGuide(representation, self.maps.views, sampling)
+            self.own_share = self._share_of_own_lobes(props)
+            if self.own_share < 1:
+                guided = "cosine" if self.own_share < 0 else "data"
+                self.guide = LightGuide(representation, self.maps.views, guided)
             flags = (
                 mi.BSDFFlags.GlossyReflection
                 | mi.BSDFFlags.FrontSide
@@ -136,6 +141,15 @@ def make_bsdf():
             )
             self.m_components = [flags]
             self.m_flags = flags
+
+        def _share_of_own_lobes(self, props):
+            """Share of the method's own proposal in [0, 1], beside the guide; −1: neither."""
+            shares = {"data": 0.0, "cosine": -1.0}
+            if hasattr(self.evaluator, "proposal"):
+                shares |= {"lobes": 1.0, "both": 0.5}
+            return shares[
+                _choice(props, "sampling", getattr(self.evaluator, "sampling", "data"), tuple(shares))
+            ]
 
         def _level_of_detail(self, props):
             """What chooses λ, or None for a method without levels; parameters are checked either way."""
@@ -177,7 +191,7 @@ def make_bsdf():
             return ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
 
         def _view(self, si, w_view, active):
-            """What is known of the view alone: arguments of the evaluator, and tables of the guide.
+            """What is known of the view alone: arguments of the evaluator, and what proposes light directions.
 
             An evaluator with geometry finds the point that the view sees, and the guide looks its tables up there;
             others stay at ``uv``.
@@ -188,7 +202,12 @@ def make_bsdf():
             if hasattr(self.evaluator, "hit"):
                 hit, place = self.evaluator.hit(uv, w_view, active)
                 known = known | {"hit": hit}
-            return known, self.guide.neighbours(place, w_view, known.get("lod"))
+            if self.own_share > 0:
+                own = self.evaluator.proposal(uv, w_view, active, **known)
+                if self.own_share == 1:
+                    return known, own
+            guided = Guided(self.guide, self.guide.neighbours(place, w_view, known.get("lod")))
+            return known, guided if self.own_share <= 0 else Mixture(own, guided, self.own_share)
 
         def _value(self, ctx, si, w_light, w_view, active, known=None):
             if ctx.mode == mi.TransportMode.Importance:
@@ -215,15 +234,15 @@ def make_bsdf():
                 return mi.Float(0)
             # The sampled direction always plays the light: a guide for importance transport is not worth its memory.
             w_view, w_light, active = self._directions(si, wo, active)
-            return self.guide.pdf(self._view(si, w_view, active)[1], w_light, active)
+            return self._view(si, w_view, active)[1].pdf(w_light, active)
 
         def eval_pdf(self, ctx, si, wo, active=True):
             if not self._enabled(ctx):
                 return mi.Color3f(0), mi.Float(0)
             w_view, w_light, active = self._directions(si, wo, active)
-            known, tables = self._view(si, w_view, active)
+            known, proposal = self._view(si, w_view, active)
             value = self._value(ctx, si, w_light, w_view, active, known)
-            return value, self.guide.pdf(tables, w_light, active)
+            return value, proposal.pdf(w_light, active)
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             bs = dr.zeros(mi.BSDFSample3f)
@@ -231,15 +250,15 @@ def make_bsdf():
                 return bs, mi.Color3f(0)
             w_view, view_valid = self._local(si.wi)
             active = mi.Bool(active) & view_valid
-            known, tables = self._view(si, w_view, active)
-            bs.wo = self._turn(self.guide.sample(tables, sample1, sample2), -1)
+            known, proposal = self._view(si, w_view, active)
+            bs.wo = self._turn(proposal.sample(sample1, sample2), -1)
             bs.eta = 1.0
             bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
             bs.sampled_component = 0
             w_light, light_valid = self._local(bs.wo)
             active &= light_valid
             value = self._value(ctx, si, w_light, w_view, active, known)
-            bs.pdf = self.guide.pdf(tables, w_light, active)
+            bs.pdf = proposal.pdf(w_light, active)
             usable = active & (bs.pdf > 0)
             return bs, dr.select(usable, value / bs.pdf, 0)
 

@@ -5,14 +5,19 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from btfref.conventions import LUMINANCE
 from btfref.numerics.frames import ROTATION_FLOOR
 from mitsuba_plugins.heightfield import HeightField
 from mitsuba_plugins.lookup import wide
+from mitsuba_plugins.microfacets import HalfVectors, Microfacets
 from mitsuba_plugins.parabolic import ParabolicMaps, bilinear_stencil
 
 
 class Evaluator:
     """Marches to the surface, to the light, and evaluates the microfacet materials around the hit."""
+
+    #: What samples light directions unless told otherwise; measured by ``btfref bench sampling``.
+    sampling = "both"
 
     def __init__(self, maps):
         self.shape, self.filter_type = maps.shape, maps.filter_type
@@ -25,6 +30,7 @@ class Evaluator:
         self.field = HeightField(tensors["cells"].array, self.shape, self.constants)
         self.surface, self.gloss = wide(tensors["surface"]), wide(tensors["gloss"])
         self.colour, self.ndf = wide(tensors["colour"]), ParabolicMaps(tensors["ndf"], 1)
+        self.half_vectors = HalfVectors(tensors["ndf"].numpy())
 
     def hit(self, uv, w_view, active):
         """The point that a view ray hits, for :meth:`evaluate`, and its texture coordinates, for sampling."""
@@ -59,6 +65,26 @@ class Evaluator:
             gloss += share * self.ndf.lookup(mi.UInt32(material), stencil, active)
         value = dr.fma(diffuse, light * dr.inv_pi, gloss * factor)
         return dr.select(active, value, 0)
+
+    def proposal(self, uv, w_view, active, hit=None):
+        """Half vectors of the nearest texel's material, and its diffuse part, in the frame of the hit."""
+        cell, local, _ = hit or self.field.view_hit(uv, w_view, active)
+        texels = self._texels(cell, local)
+        frame = self._frame(texels, active)
+        nearest, most = texels[0]
+        for texel, weight in texels[1:]:
+            nearest, most = dr.select(weight > most, texel, nearest), dr.maximum(weight, most)
+        red, green, blue, r0 = dr.detach(dr.gather(mi.Vector4f, self.colour, nearest, active))
+        material, amount, _, _ = dr.detach(dr.gather(mi.Vector4f, self.gloss, nearest, active))
+        material = mi.UInt32(material)
+        # Albedos: of the gloss as if all half vectors were the normal, ∫ 4 p F g (k·h) dω_h.
+        cosine = dr.clip(dr.dot(w_view, frame[2]), 0.05, 1)
+        fresnel = dr.fma(1 - r0, (1 - cosine) ** 5, r0)
+        total = dr.gather(mi.Float, self.half_vectors.total, material, active)
+        gloss = amount * fresnel * total * 4 * cosine / (2 - cosine)
+        diffuse = dr.dot(mi.Color3f(red, green, blue), mi.Color3f(*LUMINANCE.tolist()))
+        share = gloss / dr.maximum(gloss + diffuse, 1e-20)
+        return Microfacets(self.half_vectors, material, dr.detach(frame), w_view, share)
 
     def _texels(self, cell, local):
         """Texels that a point blends and their weights, as `btfref.representations.gbrdf.texel_weights`."""

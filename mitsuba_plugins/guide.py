@@ -20,7 +20,6 @@ N_CELLS = N_RADIAL * N_AZIMUTH
 
 #: An entry of an alias table is one word: the alias below, the threshold above.
 ALIAS_BITS = N_CELLS.bit_length() - 1
-ALIAS_STEPS = 1 << (32 - ALIAS_BITS)
 
 #: Share of pure cosine sampling: bounds the weight of a sample by 1 / share times that of cosine sampling, for texels
 #: that differ from their group's mean.
@@ -72,18 +71,20 @@ def cell_densities(mean, lights):
     return (COSINE_SHARE + (1 - COSINE_SHARE) * density).astype(np.float32)
 
 
-def alias_tables(weights):
+def alias_tables(weights, bits=ALIAS_BITS):
     """Alias tables (Walker 1977, in Vose's construction, all rows at once).
 
     Parameters
     ----------
-    weights : ndarray, shape (n_tables, N_CELLS)
-        Positive; proportional to the probabilities.
+    weights : ndarray, shape (n_tables, n)
+        Non-negative, not all 0 in a row; proportional to the probabilities.
+    bits : int
+        Of an entry for the alias: 2^bits ≥ n.
 
     Returns
     -------
-    ndarray of uint32, shape (n_tables, N_CELLS)
-        Threshold in steps of 1 / ``ALIAS_STEPS`` above the ``ALIAS_BITS`` low bits, which hold the alias.
+    ndarray of uint32, shape (n_tables, n)
+        Threshold in steps of 2^(bits − 32) above the ``bits`` low bits, which hold the alias. See :func:`drawn`.
     """
     n_tables, n = weights.shape
     share = np.asarray(weights, float) * (n / weights.sum(1, keepdims=True))
@@ -105,8 +106,36 @@ def alias_tables(weights):
         large = np.where(exhausted, large - 1, large)
         # A table whose walkers met is done: the rest keeps itself.
         poor = np.where(small >= large, order[row, large], poor)
-    steps = np.round(threshold * ALIAS_STEPS).astype(np.uint32)
-    return np.minimum(steps, ALIAS_STEPS - 1) << ALIAS_BITS | alias.astype(np.uint32)
+    most = 1 << (32 - bits)
+    steps = np.round(threshold * most).astype(np.uint32)
+    return np.minimum(steps, most - 1) << bits | alias.astype(np.uint32)
+
+
+def drawn(tables, first, count, bits, sample):
+    """A cell of an alias table, and a number in [0, 1) that is uniform again.
+
+    Parameters
+    ----------
+    tables : UInt32
+        Entries of :func:`alias_tables`, one table after the other.
+    first : UInt32
+        Where the table begins.
+    count, bits : int
+        Cells of a table, and bits of an alias.
+    sample : Float
+        Uniform in [0, 1).
+    """
+    scaled = sample * count
+    cell = dr.minimum(mi.UInt32(scaled), count - 1)
+    rest = scaled - mi.Float(cell)
+    entry = dr.gather(mi.UInt32, tables, first + cell)
+    threshold = mi.Float(entry >> bits) * 2.0 ** (bits - 32)
+    keep = rest < threshold
+    cell = dr.select(keep, cell, entry & ((1 << bits) - 1))
+    # What is left of the number, after its two decisions, is uniform again.
+    below, above = (dr.maximum(x, 1e-20) for x in (threshold, 1 - threshold))
+    x = dr.select(keep, rest / below, (rest - threshold) / above)
+    return cell, dr.clip(x, 0, dr.one_minus_epsilon(mi.Float))
 
 
 class LightGuide:
@@ -202,18 +231,8 @@ class LightGuide:
             # A view without weight is never chosen: its interval is empty.
             table = dr.select((sample1 >= cumulative) & (weight > 0), following, table)
             cumulative = cumulative + weight
-        scaled = sample2.x * N_CELLS
-        cell = dr.minimum(mi.UInt32(scaled), N_CELLS - 1)
-        rest = scaled - mi.Float(cell)
-        entry = dr.gather(mi.UInt32, self.alias, table * N_CELLS + cell)
-        threshold = mi.Float(entry >> ALIAS_BITS) * (1 / ALIAS_STEPS)
-        keep = rest < threshold
-        cell = dr.select(keep, cell, entry & (N_CELLS - 1))
-        # What is left of the first number, after its two decisions, is uniform again.
-        x = dr.select(
-            keep, rest / dr.maximum(threshold, 1e-20), (rest - threshold) / dr.maximum(1 - threshold, 1e-20)
-        )
-        radial = (mi.Float(cell // N_AZIMUTH) + dr.clip(x, 0, dr.one_minus_epsilon(mi.Float))) / N_RADIAL
+        cell, x = drawn(self.alias, table * N_CELLS, N_CELLS, ALIAS_BITS, sample2.x)
+        radial = (mi.Float(cell // N_AZIMUTH) + x) / N_RADIAL
         # The sum may round up to 1, which is the horizon.
         radial = dr.minimum(radial, dr.one_minus_epsilon(mi.Float))
         azimuth = (mi.Float(cell % N_AZIMUTH) + sample2.y) * (2 * np.pi / N_AZIMUTH)

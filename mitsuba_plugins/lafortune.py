@@ -5,8 +5,10 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from btfref.numerics.powers import FLOOR
 from mitsuba_plugins.analytic import held, packet, safe_power
 from mitsuba_plugins.lookup import texel_stencil
+from mitsuba_plugins.proposals import CosineLobes
 
 
 class Evaluator:
@@ -48,3 +50,21 @@ class Evaluator:
             value *= share * self.factor(texel, views, active)
             total += value * mi.Color3f(red, green, blue)
         return total * (fade * light.z)
+
+    def proposal(self, uv, w_view, active):
+        """The lobes of the nearest texel for the view, and its diffuse part; a common factor does not matter."""
+        v, _ = held(w_view, self.view_edge)
+        (texel,), _ = texel_stencil(uv, self.shape, "nearest")
+        *_, diffuse = packet(dr.detach(self.colour), texel, 4, active)
+        peaks = packet(dr.detach(self.peaks), texel, self.width, active)
+        values = packet(dr.detach(self.lobes), texel, 4 * self.n_lobes, active)
+        lobes = []
+        for j in range(self.n_lobes):
+            x, y, z, exponent = values[4 * j : 4 * j + 4]
+            t = mi.Vector3f(x, y, z) * v
+            size = dr.norm(t)
+            axis = dr.select(size > FLOOR, t / dr.maximum(size, FLOOR), mi.Vector3f(0, 0, 1))
+            # The light's cosine, which the lobe multiplies, is about that of its axis.
+            cosine = dr.maximum(axis.z, 1 / (exponent + 2))
+            lobes.append((axis, exponent, peaks[j] * safe_power(size, exponent) * cosine))
+        return CosineLobes(diffuse * dr.pi, lobes)

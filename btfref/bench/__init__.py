@@ -16,5 +16,6 @@ SUITES = {
     "lod": "btfref.bench.lod",
     "pyramid": "btfref.bench.pyramid",
     "reflectance": "btfref.bench.reflectance",
+    "sampling": "btfref.bench.sampling",
     "synth": "btfref.bench.synth",
 }
