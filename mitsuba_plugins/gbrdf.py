@@ -16,7 +16,7 @@ from mitsuba_plugins.parabolic import ParabolicMaps, bilinear_stencil
 class Evaluator:
     """Marches to the surface, to the light, and evaluates the microfacet materials around the hit."""
 
-    #: What samples light directions unless told otherwise; measured by ``btfref bench sampling``.
+    #: What samples light directions unless told otherwise; measured by ``btfref bench proposals``.
     sampling = "both"
 
     def __init__(self, maps):

@@ -13,7 +13,7 @@ from mitsuba_plugins.proposals import CosineLobes
 class Evaluator:
     """Evaluates the lobes of the neighbouring texels and views."""
 
-    #: What samples light directions unless told otherwise; measured by ``btfref bench sampling``.
+    #: What samples light directions unless told otherwise; measured by ``btfref bench proposals``.
     sampling = "both"
 
     def __init__(self, maps):

@@ -14,8 +14,8 @@ SUITES = {
     "gbrdf": "btfref.bench.gbrdf",
     "lobes": "btfref.bench.lobes",
     "lod": "btfref.bench.lod",
+    "proposals": "btfref.bench.proposals",
     "pyramid": "btfref.bench.pyramid",
     "reflectance": "btfref.bench.reflectance",
-    "sampling": "btfref.bench.sampling",
     "synth": "btfref.bench.synth",
 }

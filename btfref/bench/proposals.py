@@ -79,7 +79,7 @@ def run(*, quick=False, progress=None, btf=None, only=None):
                 result[cell] = _efficiency(pictures, summary(raw[cell], CHOICES[0]))
     parameters = {"spp": SAMPLES, "size": SIZE, "pictures": PICTURES, "shape": list(btf.values.shape)}
     return {
-        "suite": "sampling",
+        "suite": "proposals",
         "parameters": parameters,
         "raw": raw,
         "summary": result,
