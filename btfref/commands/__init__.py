@@ -16,6 +16,7 @@ COMMANDS = (
     "realtime",
     "compare",
     "demand",
+    "validate",
     "bench",
     "stress",
 )

@@ -349,6 +349,8 @@ def _measure(entry, name, table, comparison, mask):
         if entry == "failing_fraction":
             return float(np.mean(error > table["failing_above"]))
         return metrics.percentiles(error)[entry]
+    if entry.startswith("code_"):
+        return metrics.percentiles(metrics.code_error(t, r).max(-1))[entry.removeprefix("code_")]
     if entry == "lost_negative":
         return metrics.lost_negative(t, r)
     if entry in ("rejected_fraction", "relative_rmse", "relative_tile_bias"):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from btfref.errors import InputError
+from btfref.numerics.colour import encode_srgb
 
 #: Added to the squared reference in relMSE: (test - reference)² / (reference² + ε).
 RELMSE_EPSILON = 1e-2
@@ -142,6 +143,12 @@ def relative_error(test, reference, *, floor=FLOOR, largest=None):
         error / np.where(scale > 0, scale, 1.0),
         np.where(error > 0, np.inf, 0.0),
     )
+
+
+def code_error(test, reference):
+    """Absolute differences in steps of 8-bit sRGB codes, both clipped to [0, 1]; same shape."""
+    t, r = (encode_srgb(np.clip(np.nan_to_num(x), 0.0, 1.0)) for x in paired(test, reference))
+    return 255 * np.abs(t - r)
 
 
 def lost_negative(test, reference):

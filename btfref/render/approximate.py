@@ -19,7 +19,7 @@ from btfref.render.scene import read_scene
 from btfref.render.visible import visible_points
 
 
-def approximate(scene, *, parameters=None, path="auto", grid=4, size=None, **options):
+def approximate(scene, *, parameters=None, path="auto", grid=4, size=None, load_file=None, **options):
     """What :func:`btfref.render.realtime.realtime` approximates, evaluated in float64.
 
     Parameters
@@ -33,6 +33,8 @@ def approximate(scene, *, parameters=None, path="auto", grid=4, size=None, **opt
         n of the n × n sub-pixel samples, at (i + ½)/n.
     size : (int, int), optional
         Width and height in place of the scene's.
+    load_file : callable, optional
+        ``path -> Representation``; the default reads the files.
     **options
         ``lights``, ``order`` and ``window`` as for ``realtime``.
 
@@ -61,7 +63,7 @@ def approximate(scene, *, parameters=None, path="auto", grid=4, size=None, **opt
             total = np.zeros((points.shape[0] * points.shape[1], 3))
         name = points.material.filename
         if name not in reps:
-            reps[name] = representations.load(name)
+            reps[name] = (load_file or representations.load)(name)
             if lighting is not None:
                 prepared[name] = lighting.prepared(reps[name], file=name)
         rep = _filtered(reps[name], points.material.filter_type)

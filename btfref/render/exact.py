@@ -14,9 +14,9 @@ import time
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.render import hits
-from btfref.render.reference import loaded
+from btfref.render.reference import film_rays, loaded
 from btfref.render.result import RenderResult
+from btfref.render.scene import read_scene
 
 #: Independent pictures that the result is the mean of.
 BATCHES = 4
@@ -66,7 +66,7 @@ def render_exact(
         if value < least:
             raise InputError("too few samples", field=name, got=value, expected=f"≥ {least}")
     start = time.perf_counter()
-    description, material = hits.single_material(scene, parameters, size=size)
+    description, material = _single_material(scene, parameters, size=size)
     mesostructure, depth = mesostructure_of(material.filename)
     depth = depth if max_depth is None else max_depth
     height, width = description.camera.height, description.camera.width
@@ -112,7 +112,7 @@ def _pass(scene, material, tiles, grid, rounds, stream, max_depth):
     pixel, cell = (lane // each) % (width * height), lane % grid**2
     u, v, _, _ = uniforms(lane, keys, mi.UInt32(0))
     offset = (mi.Float(cell % grid) + u) / grid, (mi.Float(cell // grid) + v) / grid
-    si, uv, w_view, lights = hits.intersect(scene, material, offset, pixel)
+    si, uv, w_view, lights = _intersect(scene, material, offset, pixel)
     lights = [(w, dr.select(w.z > 0, power, 0)) for w, power in lights]
     origin = dr.fma(w_view, START, mi.Point3f(uv.x - dr.floor(uv.x), uv.y - dr.floor(uv.y), 0))
     samples = dr.zeros(mi.Color3f, dr.width(lane))
@@ -169,3 +169,93 @@ def _vertex(tiles, state, number, keys, samples):
     state = (lane, mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Color3f(throughput), lights)
     dr.eval(state, alive, samples)
     return state, alive
+
+
+def _single_material(scene, parameters=None, *, size=None):
+    """The description of a scene whose shapes all show one BTF, and that material.
+
+    Returns
+    -------
+    SceneDescription, BtfMaterial
+
+    Raises
+    ------
+    InputError
+        When the scene cannot be read, or shows several materials or none.
+    """
+    description = read_scene(scene, parameters, size=size)
+    materials = [mesh.material for mesh in description.meshes]
+    first = materials[0] if materials else None
+    same = first is not None and all(
+        m is not None
+        and (m.filename, m.filter_type, m.scale, m.twosided)
+        == (first.filename, first.filter_type, 1.0, first.twosided)
+        and np.array_equal(m.to_uv, first.to_uv)
+        for m in materials
+    )
+    if not same:
+        raise InputError(
+            "all shapes must show one btf material of scale 1", file=description.source, field="bsdf"
+        )
+    return description, first
+
+
+def _delta_lights(scene):
+    """The emitters of a Mitsuba scene, refused unless all are directional or points."""
+    import mitsuba as mi
+
+    delta = int(mi.EmitterFlags.DeltaPosition) | int(mi.EmitterFlags.DeltaDirection)
+    for emitter in scene.emitters():
+        if not int(emitter.flags()) & delta:
+            raise InputError(
+                "hits know delta lights only",
+                field="emitter",
+                got=emitter.class_name(),
+                expected="point, directional",
+            )
+    return scene.emitters()
+
+
+def _intersect(scene, material, offset, pixel=None):
+    """Hits of one camera ray a pixel, as Dr.Jit arrays.
+
+    Parameters
+    ----------
+    scene : mitsuba.Scene
+    material : BtfMaterial
+    offset : (float or mitsuba.Float, float or mitsuba.Float)
+        Place in each pixel, from its top left.
+    pixel : mitsuba.UInt32, optional
+        Flat indices of the pixels; by default all, one after the other.
+
+    Returns
+    -------
+    si : mitsuba.SurfaceInteraction3f
+        In Mitsuba's frame, for what else a caller needs.
+    uv : mitsuba.Point2f
+    w_view : mitsuba.Vector3f
+    lights : list of (mitsuba.Vector3f, mitsuba.Color3f)
+        Direction in the texture's frame, and irradiance perpendicular to it: 0 where a light does not reach, cast
+        shadows apart.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    ray, _ = film_rays(scene.sensors()[0], offset, pixel)
+    si = scene.ray_intersect(ray)
+    (a, b, c), (d, e, f) = material.to_uv.tolist()
+    u, v = si.uv
+    uv = mi.Point2f(dr.fma(u, a, dr.fma(v, b, c)), dr.fma(u, d, dr.fma(v, e, f)))
+    cosine, sine = (float(x) for x in material.rotation)
+    side = dr.select((si.wi.z < 0) & material.twosided, mi.Float(-1), mi.Float(1))
+
+    def local(w):
+        turned = mi.Vector3f(cosine * w.x - sine * w.y, sine * w.x + cosine * w.y, w.z * side)
+        return turned if (cosine, sine) != (1.0, 0.0) else mi.Vector3f(w.x, w.y, w.z * side)
+
+    lights = []
+    for emitter in _delta_lights(scene):
+        sample, power = emitter.sample_direction(si, mi.Point2f(0.5), si.is_valid())
+        power = dr.select(si.is_valid() & (sample.pdf > 0), mi.Color3f(power), 0)
+        lights.append((local(si.to_local(sample.d)), power))
+    return si, uv, local(si.wi), lights

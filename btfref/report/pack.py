@@ -10,7 +10,7 @@ import numpy as np
 _LARGEST = 32768.0
 
 
-def pack(values, *, bits=8):
+def pack(values, *, bits=8, base=None):
     """Numbers for the page: scaled half floats with a shortened mantissa, deflated, base64.
 
     Parameters
@@ -20,22 +20,27 @@ def pack(values, *, bits=8):
     bits : int, optional
         Mantissa bits kept, at most 10: the lowest are noise to a viewer, and noise is what costs space. The
         relative error is at most 2^-(bits + 1) + 2^-11 for values above 2^-29 of the largest.
+    base : (str, array), optional
+        Label and values of a picture, packed with the same bits, that is nearly the same: only what differs from its
+        bits is kept.
 
     Returns
     -------
     dict
         ``width``, ``height``, ``channels``; ``scale`` to multiply by; ``drop``, the bits to shift back;
-        ``delta``, whether rows hold differences from pixel to pixel; ``data``.
+        ``delta``, whether rows hold differences from pixel to pixel; ``data``; ``base``, the label, where it is used.
     """
     values = np.asarray(values, np.float64)
     values = values[..., None] if values.ndim == 2 else values
-    finite = np.isfinite(values)
-    largest = float(np.max(np.abs(values), where=finite, initial=0.0))
-    scale = largest / _LARGEST or 1.0  # also where the quotient underflows
-    drop = 10 - bits
-    half = np.where(finite, values / scale, np.nan).astype(np.float16)
-    code = (half.view(np.uint16).astype(np.uint32) + ((1 << drop) >> 1)) >> drop
-    code = np.moveaxis(code.astype(np.uint16), -1, 0)
+    scale = _scale(values)
+    if base is not None:
+        label, other = base[0], np.reshape(np.asarray(base[1], np.float64), values.shape)
+        # The base's scale, so that equal values have equal bits; half floats leave room for twice its largest.
+        base = label if scale < 1.9 * _scale(other) else None
+        scale = _scale(other) if base else scale
+    code = _codes(values, scale, bits)
+    if base is not None:
+        code = code ^ _codes(other, scale, bits)
     difference = np.diff(code, axis=-1, prepend=np.uint16(0))  # wraps, and so does the sum that undoes it
     plain, delta = (_deflate(x) for x in (code, difference))
     height, width, channels = values.shape
@@ -44,30 +49,53 @@ def pack(values, *, bits=8):
         "height": height,
         "channels": channels,
         "scale": scale,
-        "drop": drop,
+        "drop": 10 - bits,
         "delta": len(delta) < len(plain),
         "data": base64.b64encode(min(plain, delta, key=len)).decode("ascii"),
+        **({"base": base} if base is not None else {}),
     }
 
 
-def unpack(packed):
+def _scale(values):
+    """Largest finite value as half floats have it best."""
+    largest = float(np.max(np.abs(values), where=np.isfinite(values), initial=0.0))
+    return largest / _LARGEST or 1.0  # also where the quotient underflows
+
+
+def _codes(values, scale, bits):
+    """Shortened half floats, (C, H, W) uint16."""
+    drop = 10 - bits
+    half = np.where(np.isfinite(values), values / scale, np.nan).astype(np.float16)
+    code = (half.view(np.uint16).astype(np.uint32) + ((1 << drop) >> 1)) >> drop
+    return np.moveaxis(code.astype(np.uint16), -1, 0)
+
+
+def unpack(packed, base=None):
     """What the page makes of `pack`'s result.
 
     Parameters
     ----------
     packed : dict
+    base : dict, optional
+        The packed picture that ``packed["base"]`` names.
 
     Returns
     -------
     (H, W, C) float64 array
     """
+    code = _decoded(packed)
+    if base is not None:
+        code = code ^ _decoded(base)
+    half = (code << packed["drop"]).view(np.float16)
+    return np.moveaxis(half.astype(np.float64) * packed["scale"], 0, -1)
+
+
+def _decoded(packed):
+    """The codes as they are stored, (C, H, W) uint16."""
     raw = np.frombuffer(zlib.decompress(base64.b64decode(packed["data"])), np.uint8).astype(np.uint16)
     high, low = raw.reshape(2, packed["channels"], packed["height"], packed["width"])
     code = (high << 8) | low
-    if packed["delta"]:
-        code = np.cumsum(code, axis=-1, dtype=np.uint16)
-    half = (code << packed["drop"]).view(np.float16)
-    return np.moveaxis(half.astype(np.float64) * packed["scale"], 0, -1)
+    return np.cumsum(code, axis=-1, dtype=np.uint16) if packed["delta"] else code
 
 
 def _deflate(code):

@@ -12,7 +12,7 @@ from btfref.report.pack import pack
 from btfref.report.text import badge, class_table, gate_list, limit_name, number
 
 
-def article(index, cell):
+def article(index, cell, *, extra="", images=None, bits=6):
     """The cell's part of the page.
 
     Parameters
@@ -20,6 +20,13 @@ def article(index, cell):
     index : int
         Its number on the page.
     cell : Cell
+    extra : str
+        HTML between the pictures and the numbers.
+    images : dict of str to dict, optional
+        Packed pictures by label (see `btfref.report.pack.pack`), or ``{"shared": key}``; by default all are packed
+        here.
+    bits : int
+        Mantissa bits of the error maps.
 
     Returns
     -------
@@ -35,7 +42,8 @@ def article(index, cell):
     if cell.comparison is None and cell.images:
         parts.append('<p class="alert">These pictures were not compared, which counts as a failure.</p>')
     if cell.images:
-        parts.append(_stage(index, cell))
+        parts.append(_stage(index, cell, images, bits))
+    parts.append(extra)
     table = class_table(cell.comparison) if cell.comparison and cell.comparison.metrics else ""
     parts.append(
         f'<div class="numbers"><section>{table}{_remarks(cell.comparison)}</section>'
@@ -72,7 +80,7 @@ def _remarks(comparison):
     return f'<ul class="counts">{"".join(found)}</ul>' if found else ""
 
 
-def _stage(index, cell):
+def _stage(index, cell, packed, bits):
     """Viewer, maps and charts of a cell with pictures."""
     limits = [
         (f"{gate.gate.rpartition('.')[2]}, {limit_name(gate.entry)}".replace("_", " "), gate.limit)
@@ -83,13 +91,14 @@ def _stage(index, cell):
         "stops": cell.display.stops,
         "limits": [limit for _, limit in limits],
         "images": {
-            key: pack(image) | {"name": LABELS.get(key, (key,))[0]} for key, image in cell.images.items()
+            key: (packed[key] if packed else pack(image)) | {"name": LABELS.get(key, (key,))[0]}
+            for key, image in cell.images.items()
         },
         "maps": {},
     }
     charts = []
     if cell.comparison is not None and cell.comparison.maps:
-        pixels |= _maps(cell.comparison)
+        pixels |= _maps(cell.comparison, bits)
         charts = _charts(cell.comparison, limits)
     first, second = cell.pair
     pixels["pair"] = [LABELS.get(key, (key,))[0] for key in (second, first)]
@@ -117,14 +126,14 @@ def _options(cell, chosen):
     )
 
 
-def _maps(comparison):
+def _maps(comparison, bits):
     """Errors per pixel for the page; in the order in which it shows them."""
     signed = signed_difference(comparison)
     finite = np.isfinite(comparison.maps["difference"]).all(-1)
-    maps = {"difference": pack(np.where(finite, signed, np.nan), bits=6)}
+    maps = {"difference": pack(np.where(finite, signed, np.nan), bits=bits)}
     for name in ("relative", "flip", "delta_e00"):
         if name in comparison.maps:
-            maps[name] = pack(comparison.maps[name], bits=6)
+            maps[name] = pack(comparison.maps[name], bits=bits)
     maps["classes"] = pack(comparison.classes, bits=4)
     if "p_value" in comparison.maps:
         maps["p_value"] = pack(np.nan_to_num(comparison.maps["p_value"], nan=1.0).min(-1), bits=4)

@@ -127,7 +127,7 @@ def _save(path, result):
 
 
 def _cell(cache, spec, settings):
-    from btfref.render.definition import render_definition
+    from btfref.render.approximate import approximate
     from btfref.render.realtime import realtime
     from btfref.render.reference import render
     from btfref.representations.container import read_info
@@ -137,7 +137,7 @@ def _cell(cache, spec, settings):
     views = make_views(cache, spec.mesostructure, spec.scene, spec.lights, settings)
     size = (settings.size, settings.size)
     shared = {"parameters": {"btf": str(file), "lights": spec.lights}, "size": size}
-    definition = render_definition(path, grid=settings.grid, **shared)
+    definition = approximate(path, grid=settings.grid, **shared)
     reference = render(path, noise_free=settings.grid, shadows=False, **shared)
     image = realtime(path, grid=settings.grid, **shared)
 

@@ -20,27 +20,8 @@ UVS = ((0.31, 0.47), (0.83, 0.12))
 VIEWS = {"normal": (0.0, 0.0, 1.0), "oblique": (0.5, -0.4, 0.77), "grazing": (0.1, 0.99, 0.08)}
 
 
-def plugin_values(path, uv, w_light, w_view, **parameters):
-    """Values of a representation by its Dr.Jit port.
-
-    Parameters
-    ----------
-    path : path-like
-    uv, w_light, w_view : ndarray, shape (N, 2), (N, 3), (N, 3)
-    **parameters
-        Of the plugin.
-
-    Returns
-    -------
-    ndarray of float32, shape (N, 3)
-    """
-    mi, plugin = _plugin(path, **parameters)
-    value = plugin.eval(mi.BSDFContext(), _interaction(mi, uv, w_view), mi.Vector3f(np.asarray(w_light).T))
-    return np.array(value).T
-
-
 def probe_gates(path, *, seed=7):
-    """Both ports against the float64 definition at ordinary and awkward lookups.
+    """Both ports against the float64 definition at ordinary and awkward lookups, and at all levels of detail.
 
     Parameters
     ----------
@@ -54,18 +35,24 @@ def probe_gates(path, *, seed=7):
         ``probe.agreement`` of Dr.Jit, then of GLSL, and ``probe.finite``; the detail says whose.
     """
     from btfref.numerics.directions import DirectionSet
-    from btfref.render.probe import probe
     from btfref.representations import load
+    from btfref.stress.evaluators import definition, port
+    from btfref.stress.lookups import Lookups
 
     representation = load(path)
     arrays = representation.arrays()
     views, lights = (
         DirectionSet(arrays[f"{name}_directions"].astype(float), "custom") for name in ("view", "light")
     )
-    points = probe_points(np.random.default_rng(seed), PROBES, views, lights)
-    reference = representation.evaluate(*points)
+    rng = np.random.default_rng(seed)
+    points = probe_points(rng, PROBES, views, lights)
+    lod = rng.uniform(0, getattr(representation, "max_lod", 0), PROBES).astype(np.float32)
+    drawn = [np.zeros(PROBES, np.uint8)] * 4
+    lookups = Lookups(*points, lod, *drawn)
+    reference = definition(representation, lookups)
     gates, bad = [], 0
-    for name, value in (("Dr.Jit", plugin_values(path, *points)), ("GLSL", probe(representation, *points))):
+    for key, name in {"drjit": "Dr.Jit", "glsl": "GLSL"}.items():
+        value = port(key, representation, path)(lookups)
         allowance = hit_allowance(representation, value, reference, points)
         found = agreement(value, reference, allowance=allowance)
         gates += [_named(gate, name) for gate in found.gates]
@@ -166,14 +153,6 @@ def _plugin(path, **parameters):
         parsing.use_variant("llvm_ad_rgb")
     mitsuba_plugins.register()
     return mi, mi.load_dict({"type": "btf", "filename": str(path), **parameters})
-
-
-def _interaction(mi, uv, w_view):
-    import drjit as dr
-
-    si = dr.zeros(mi.SurfaceInteraction3f, len(w_view))
-    si.uv, si.wi = mi.Point2f(np.asarray(uv).T), mi.Vector3f(np.asarray(w_view).T)
-    return si
 
 
 def _place(mi, n, uv, w_view):

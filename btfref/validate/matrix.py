@@ -79,7 +79,7 @@ class Settings:
     spp: int = 16
     size: int = 112
     grid: int = 2
-    truth_spp: int = 48
+    truth_spp: int = 64
     environment_spp: int = 64
     held_out_texels: int = 32
     chi2_samples: int = 1_000_000
@@ -92,7 +92,7 @@ class Settings:
 
 FULL = Settings()
 QUICK = replace(
-    FULL, texels=32, size=72, truth_spp=32, environment_spp=32, held_out_texels=16, chi2_samples=200_000
+    FULL, texels=32, size=72, truth_spp=96, environment_spp=32, held_out_texels=16, chi2_samples=200_000
 )
 
 

@@ -68,8 +68,8 @@ def make_views(cache, mesostructure, scene, lights, settings):
 
 def _views(cache, mesostructure, scene, lights, settings):
     from btfref.registry import method
+    from btfref.render.approximate import approximate
     from btfref.render.classes import pixel_classes
-    from btfref.render.definition import render_definition
     from btfref.render.exact import render_exact
 
     stores = make_material(cache, mesostructure, settings)
@@ -78,10 +78,11 @@ def _views(cache, mesostructure, scene, lights, settings):
     parameters = {"btf": str(carrier), "lights": lights}
     shared = {"parameters": parameters, "grid": settings.grid, "size": size}
     truth = render_exact(path, spp=settings.truth_spp, seed=TRUTH_SEED, **shared)
-    tables = {name: method("raw").fit(load_material(store)) for name, store in zip("ab", stores, strict=True)}
-    seen = render_definition(path, representations=tables, **shared)
-    classes = pixel_classes(path, **shared)
-    return Views(truth.meta["batches"], seen["a"].image, seen["b"].image, classes)
+    seen = []
+    for store in stores:
+        table = method("raw").fit(load_material(store))
+        seen.append(approximate(path, load_file=lambda _, table=table: table, **shared).image)
+    return Views(truth.meta["batches"], *seen, pixel_classes(path, **shared))
 
 
 def make_carrier(cache, mesostructure, settings):

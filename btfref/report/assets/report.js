@@ -25,20 +25,23 @@
     }
     return halves;
   }
-  async function unpack(packed) {
+  // Pictures that several pages show stand in a script of their own.
+  const whole = (packed) => (packed.shared ? globalThis.sharedPictures[packed.shared] : packed);
+  async function unpack(packed, base) {
     const raw = Uint8Array.from(atob(packed.data), (c) => c.charCodeAt(0));
     const stream = new Blob([raw]).stream().pipeThrough(new DecompressionStream("deflate"));
     const bytes = new Uint8Array(await new Response(stream).arrayBuffer());
     const { width, height, channels } = packed, n = width * height, table = halfTable();
-    const values = new Float32Array(n * channels);
+    const values = new Float32Array(n * channels), codes = new Uint16Array(n * channels);
     for (let c = 0, i = 0; c < channels; c++)
       for (let y = 0; y < height; y++)
         for (let x = 0, code = 0; x < width; x++, i++) {
           const word = (bytes[i] << 8) | bytes[i + n * channels];
           code = packed.delta ? (code + word) & 65535 : word;
-          values[(y * width + x) * channels + c] = table[(code << packed.drop) & 65535] * packed.scale;
+          codes[i] = base ? code ^ base.codes[i] : code;
+          values[(y * width + x) * channels + c] = table[(codes[i] << packed.drop) & 65535] * packed.scale;
         }
-    return { ...packed, data: null, values };
+    return { ...packed, data: null, values, codes };
   }
 
   // --- colours ------------------------------------------------------------------------------------------------------
@@ -86,8 +89,9 @@
   async function build(stage) {
     const data = JSON.parse(stage.querySelector("script.pixels").textContent);
     const images = {}, maps = {};
-    for (const [label, packed] of Object.entries(data.images)) images[label] = await unpack(packed);
-    for (const [name, packed] of Object.entries(data.maps)) maps[name] = await unpack(packed);
+    for (const [label, packed] of Object.entries(data.images))
+      images[label] = { ...(await unpack(whole(packed), images[packed.base])), name: packed.name };
+    for (const [name, packed] of Object.entries(data.maps)) maps[name] = await unpack(whole(packed));
     const { width, height } = Object.values(images)[0];
     const view = { mode: "swipe", split: 0.5, second: false, stops: data.stops, zoom: 1, x: width / 2, y: height / 2 };
     const $ = (selector) => stage.querySelector(selector);

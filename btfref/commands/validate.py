@@ -1,0 +1,110 @@
+"""Validate methods and renderers: the whole matrix, and which stage is to blame; exit status 1 when a gate fails.
+
+Every method is fitted to modelled mesostructures and rendered in shipped scenes under shipped lights by both renderers.
+Each cell tells the error of every stage, from the path-traced mesostructure to the 8-bit picture. Results are kept by
+content: what has not changed is not computed again. Methods of installed packages take part like btfref's own.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from btfref.commands._shared import Progress, count, emit, emit_json, number, table
+
+
+def add_arguments(parser):
+    """Describe the command's arguments."""
+    parser.add_argument(
+        "--quick", action="store_true", help="one mesostructure, three views a method, small pictures"
+    )
+    parser.add_argument("--only", metavar="METHOD[,METHOD]", help="these methods instead of all")
+    parser.add_argument("--scene", metavar="SCENE[,SCENE]", help="plane, sphere, cloth, or scene files")
+    parser.add_argument("--lights", metavar="LIGHTS[,LIGHTS]", help="such as directional1, points2")
+    parser.add_argument("--mesostructure", metavar="NAME[,NAME]", help="such as checker, rings, tissue")
+    parser.add_argument(
+        "-o", "--output", default="output/validation", metavar="FOLDER", help="default: output/validation"
+    )
+    parser.add_argument(
+        "--cache", metavar="FOLDER", help="of results (default: BTFREF_CACHE, else the user's cache)"
+    )
+    parser.add_argument(
+        "--workers", type=count(1), metavar="N", help="processes (default: by cores and memory)"
+    )
+    parser.add_argument("--no-report", action="store_true", help="numbers only")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    parser.add_argument(
+        "--self-test",
+        action="store_true",
+        help="inject known faults instead; each must be caught by its gate",
+    )
+
+
+def run(args):
+    """Carry the command out."""
+    if args.self_test:
+        return _self_test(args)
+    from btfref.validate.matrix import FULL, QUICK, select
+    from btfref.validate.run import validate
+
+    specs = select(
+        only=_names(args.only),
+        scenes=_names(args.scene),
+        lights=_names(args.lights),
+        mesostructures=_names(args.mesostructure),
+        quick=args.quick,
+    )
+    settings = QUICK if args.quick else FULL
+    with Progress() as progress:
+        result = validate(specs, settings=settings, cache=args.cache, workers=args.workers, progress=progress)
+        report = None
+        if not args.no_report:
+            from btfref.report.validation import write_validation
+
+            report = write_validation(Path(args.output), result, progress=progress)
+    if args.json:
+        emit_json(result.to_dict())
+    else:
+        for line in lines(result):
+            emit(line)
+        if report:
+            emit(f"report: {report}")
+    return 0 if result.passed else 1
+
+
+def lines(result):
+    """The outcome for a reader: a row a method and mesostructure, what failed, what took how long."""
+    from btfref.validate.summary import HEADER, rows
+
+    yield from table(
+        [[number(c) if isinstance(c, float) else c for c in row] for row in rows(result)], header=HEADER
+    )
+    yield ""
+    for name, gate in result.failed_gates:
+        yield f"{name}: {gate.line}"
+    passed = sum(cell.outcome == "pass" for cell in result.cells)
+    additive = sum(bool((cell.facts["waterfall"] or {}).get("additive")) for cell in result.cells)
+    yield (
+        f"{passed} of {len(result.cells)} cells pass; stages add up in {additive}, the others say why; "
+        f"{result.computed} of {result.jobs} jobs computed, {result.seconds:.0f} s"
+    )
+
+
+def _self_test(args):
+    from btfref.validate.self_test import self_test
+
+    with Progress() as progress:
+        caught = self_test(progress=progress)
+    if args.json:
+        emit_json({"kind": "self-test", "schema": 1, "faults": [fault.to_dict() for fault in caught]})
+    else:
+        rows = [
+            [f.name, f.meant, "caught" if f.caught else "MISSED", ", ".join(f.failed) or "none"]
+            for f in caught
+        ]
+        for line in table(rows, header=["fault", "meant for", "by it", "gates that failed"]):
+            emit(line)
+    return 0 if all(fault.caught for fault in caught) else 1
+
+
+def _names(text):
+    return text.split(",") if text else None

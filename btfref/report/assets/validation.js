@@ -1,0 +1,21 @@
+"use strict";
+// The matrix: which number its cells show, and which rows.
+(() => {
+  const table = document.querySelector(".matrix");
+  const value = document.getElementById("value"), filter = document.getElementById("filter");
+  if (!table) return;
+  function refresh() {
+    for (const cell of table.querySelectorAll("td[data-values]")) {
+      cell.querySelector(".value").textContent = JSON.parse(cell.dataset.values)[value.value] ?? "–";
+      const shade = JSON.parse(cell.dataset.shades)[value.value];
+      cell.style.setProperty("--shade", shade ?? 0);
+    }
+    table.dataset.shaded = String(value.value !== "outcome");
+    for (const row of table.querySelectorAll("tbody tr"))
+      row.hidden = filter.value !== "" && row.dataset.mesostructure !== filter.value;
+  }
+  value.addEventListener("change", refresh);
+  filter.addEventListener("change", refresh);
+  refresh();
+  document.documentElement.dataset.matrix = "ready";
+})();

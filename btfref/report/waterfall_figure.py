@@ -1,0 +1,147 @@
+"""The error waterfall as a figure: each stage's own error, and the error so far, with intervals."""
+
+from __future__ import annotations
+
+from html import escape
+
+import numpy as np
+
+from btfref.report.text import number
+
+_WIDTH, _LEFT, _RIGHT, _TOP, _ROW = 760, 108, 132, 30, 34
+
+#: Smallest decade below the largest error that is drawn.
+DECADES = 8
+
+
+def waterfall_figure(fall):
+    """Bars of RMSE on a logarithmic scale, one row a stage.
+
+    Parameters
+    ----------
+    fall : dict
+        `btfref.compare.waterfall.Waterfall.to_dict`.
+
+    Returns
+    -------
+    str
+        An ``<svg>`` element whose colours come from the page's style.
+    """
+    stages = fall["stages"]
+    values = [s["rmse"]["high"] for s in stages] + [s["rmse_so_far"]["high"] for s in stages]
+    largest = max([v for v in values if v > 0], default=1.0)
+    top = float(np.ceil(np.log10(largest) + 1e-9))
+    there = [v for s in stages for v in (s["rmse"]["estimate"],) if v > 0]
+    low = max(top - DECADES, float(np.floor(np.log10(min(there, default=largest)))))
+    low = min(low, top - 1)
+    height = _TOP + _ROW * (len(stages) + 1) + 30
+
+    def x(value):
+        log = np.log10(value) if value > 0 else low
+        return _LEFT + (np.clip(log, low, top) - low) / (top - low) * (_WIDTH - _LEFT - _RIGHT)
+
+    base = _TOP + _ROW * (len(stages) + 1)
+    parts = []
+    for decade in range(int(low), int(top) + 1):
+        at = x(10.0**decade)
+        parts.append(f'<line class="grid" x1="{at:.1f}" y1="{_TOP}" x2="{at:.1f}" y2="{base}"/>')
+        parts.append(_text(at, base + 15, f"1e{decade}".replace("-", "−"), "middle"))
+    for row, stage in enumerate(stages):
+        y = _TOP + _ROW * row
+        parts.append(_text(_LEFT - 8, y + 17, stage["name"], "end", "axis"))
+        parts.append(_bar(x, stage["rmse"], y + 4, 12, "series interior", low))
+        parts.append(_bar(x, stage["rmse_so_far"], y + 18, 8, "series silhouette", low))
+        text = f"{number(stage['rmse']['estimate'])}, ΔE00 {number(stage['delta_e00']['estimate'], 2)}"
+        parts.append(_text(_WIDTH - _RIGHT + 8, y + 17, text, "start"))
+    y = _TOP + _ROW * len(stages)
+    parts.append(_text(_LEFT - 8, y + 17, "whole", "end", "axis"))
+    parts.append(_bar(x, fall["total"], y + 6, 14, "series silhouette", low))
+    colour = stages[-1]["delta_e00_so_far"]["estimate"]
+    text = f"{number(fall['total']['estimate'])}, ΔE00 {number(colour, 2)}"
+    parts.append(_text(_WIDTH - _RIGHT + 8, y + 17, text, "start"))
+    for at, kind, text in (
+        (_LEFT, "interior", "alone"),
+        (_LEFT + 70, "silhouette", "so far, against the truth"),
+    ):
+        parts.append(f'<rect class="key {kind}" x="{at}" y="8" width="10" height="10"/>')
+        parts.append(_text(at + 15, 17, text, "start"))
+    parts.append(_text((_LEFT + _WIDTH - _RIGHT) / 2, height - 2, "RMSE of radiance", "middle", "axis"))
+    return (
+        f'<svg class="chart waterfall" viewBox="0 0 {_WIDTH} {height}" role="img" '
+        f'aria-label="Errors of the stages">{"".join(parts)}</svg>'
+    )
+
+
+def _bar(x, interval, y, height, kind, low):
+    """A bar to the estimate, and its interval as a whisker."""
+    start, end = x(10.0**low), x(interval["estimate"])
+    ends = [x(interval[name]) for name in ("low", "high")]
+    middle = y + height / 2
+    bar = f'<rect class="{kind}" x="{start:.1f}" y="{y}" width="{max(end - start, 0.5):.1f}" height="{height}"/>'
+    if ends[1] - ends[0] < 0.5:
+        return bar
+    return bar + (
+        f'<path class="whisker" d="M{ends[0]:.1f} {middle}H{ends[1]:.1f}M{ends[0]:.1f} {middle - 4}v8'
+        f'M{ends[1]:.1f} {middle - 4}v8"/>'
+    )
+
+
+def waterfall_table(fall):
+    """The same numbers as a table, with intervals.
+
+    Parameters
+    ----------
+    fall : dict
+
+    Returns
+    -------
+    str
+        A ``<table>`` in a box that scrolls sideways.
+    """
+    keys = ("rmse", "rmse_so_far", "delta_e00", "delta_e00_so_far")
+    head = "".join(
+        f'<th scope="col">{name}</th>' for name in ("RMSE alone", "RMSE so far", "ΔE00 alone", "ΔE00 so far")
+    )
+    rows = "".join(
+        f'<tr><th scope="row">{escape(stage["name"])}</th>'
+        + "".join(_cell(stage[key]) for key in keys)
+        + "</tr>"
+        for stage in fall["stages"]
+    )
+    whole = f'<tr><th scope="row">whole, measured apart</th><td></td>{_cell(fall["total"])}<td></td><td></td></tr>'
+    return (
+        f'<div class="scroll"><table class="metrics"><thead><tr><th scope="col">stage</th>{head}</tr></thead>'
+        f"<tbody>{rows}{whole}</tbody></table></div>"
+    )
+
+
+def _cell(interval):
+    text = number(interval["estimate"])
+    if interval["high"] > interval["low"]:
+        text += f'<small class="muted"> {number(interval["low"], 2)} … {number(interval["high"], 2)}</small>'
+    return f"<td>{text}</td>"
+
+
+def waterfall_section(fall):
+    """Figure, table and what they add up to, as HTML; empty without a waterfall."""
+    if not fall:
+        return ""
+    noise = fall.get("sampling")
+    apart = ""
+    if noise:
+        random, rest = (number(float(np.sqrt(max(noise[name], 0))), 2) for name in ("noise", "mse"))
+        apart = (
+            f" Of the first stage, {random} is Monte Carlo noise of the samples; directions and texels alone leave "
+            f"{rest} (by an independent twin)."
+        )
+    mean = f"Mean radiance of the truth: {number(fall['mean'])} over {number(fall['pixels'])} pixels."
+    intervals = "99 % intervals hold the noise of both sides."
+    return (
+        '<section class="fall"><h3>Where the error comes from</h3>'
+        f'<div class="chartbox">{waterfall_figure(fall)}</div>{waterfall_table(fall)}'
+        f'<p class="notes">{escape(fall["explanation"] + apart)} {mean} {intervals}</p></section>'
+    )
+
+
+def _text(x, y, text, anchor, kind="tick"):
+    return f'<text class="{kind}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'

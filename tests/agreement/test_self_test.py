@@ -1,0 +1,43 @@
+"""`btfref validate` end to end on one method, and its self-test."""
+
+import json
+
+import pytest
+
+from btfref.cli import main
+from btfref.validate.self_test import FAULTS, self_test
+
+
+@pytest.fixture(autouse=True)
+def _renderers(need):
+    need("llvm")
+    need("gl")
+
+
+def test_every_fault_is_caught_by_its_gate():
+    found = self_test()
+    assert len(found) == len(FAULTS) == 12
+    assert [fault.name for fault in found if not fault.caught] == []
+    assert [fault.clean for fault in found if fault.clean] == []
+
+
+@pytest.mark.long
+def test_quick_validation_of_one_method(tmp_path, capsys):
+    """Computed once, then taken from the cache; the numbers are the same."""
+    command = ["validate", "--quick", "--only", "lpca", "--workers", "1", "--cache", str(tmp_path / "cache")]
+    command += ["-o", str(tmp_path / "report"), "--json"]
+    results = []
+    for _ in range(2):
+        assert main(command) == 0
+        results.append(json.loads(capsys.readouterr().out))
+    first, again = results
+    assert first["passed"] is True
+    assert first["computed"] == first["jobs"] == 5
+    assert again["computed"] == 0
+    assert again["cells"] == first["cells"]
+    assert len(first["cells"]) == 3
+    for cell in first["cells"]:
+        stages = {stage["name"]: stage["rmse"]["estimate"] for stage in cell["waterfall"]["stages"]}
+        # The port's rounding is far below what the fit loses, and that below the picture's brightness.
+        assert stages["port"] < 1e-3 * stages["fit"] < 1e-3 * cell["waterfall"]["mean"]
+    assert (tmp_path / "report" / "index.html").exists()

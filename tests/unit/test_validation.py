@@ -1,0 +1,246 @@
+"""The matrix of validation: selection, keys, failures, the report in a browser."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from browser import browse
+
+from btfref.compare.colour import Display
+from btfref.compare.waterfall import Picture, waterfall
+from btfref.errors import InputError
+from btfref.registry import methods
+from btfref.report.pack import pack, unpack
+from btfref.report.validation import write_validation
+from btfref.validate import cache as caching
+from btfref.validate.cache import Cache, code_of, method_files
+from btfref.validate.cell import GATES, CellResult, eight_bits, failed_cell, read_cell
+from btfref.validate.cell import _save as save_cell
+from btfref.validate.material import fit_key, material_key
+from btfref.validate.matrix import FULL, LIGHTS, MESOSTRUCTURES, QUICK, SCENES, Spec, select
+from btfref.validate.run import Validation
+from btfref.validate.summary import HEADER, rows
+
+
+def test_selection():
+    assert len(select()) == len(methods()) * len(SCENES) * len(LIGHTS) * len(MESOSTRUCTURES)
+    assert {spec.method for spec in select(quick=True)} == set(methods())
+    chosen = select(only=["lpca", "cmf"], scenes=["sphere"], lights=["points2"], mesostructures=["rings"])
+    assert chosen == [Spec("rings", key, "sphere", "points2") for key in ("cmf", "lpca")]
+    for wrong in (
+        {"only": ["jpeg"]},
+        {"scenes": ["moon"]},
+        {"lights": ["dark"]},
+        {"mesostructures": ["mud"]},
+    ):
+        with pytest.raises(InputError):
+            select(**wrong)
+
+
+def test_keys_follow_what_a_result_depends_on(tmp_path, monkeypatch):
+    assert material_key("checker", QUICK) != material_key("rings", QUICK)
+    assert material_key("checker", QUICK) != material_key("checker", replace(QUICK, spp=QUICK.spp + 1))
+    # The size of the pictures is no affair of the material's or of a fit's.
+    assert fit_key("checker", "svd", QUICK) == fit_key("checker", "svd", replace(QUICK, size=QUICK.size + 1))
+    assert fit_key("checker", "svd", QUICK) != fit_key("checker", "lpca", QUICK)
+
+    before = {key: code_of("picture", key) for key in ("svd", "lpca")}
+    owned = {row.key: method_files(row) for row in methods().values()}
+    changed = tmp_path / owned["svd"][0].name
+    changed.write_bytes(owned["svd"][0].read_bytes() + b"\n# changed\n")
+    real = caching.method_files
+
+    def of_changed(row):
+        files = real(row)
+        return [changed, *files[1:]] if row.key == "svd" else files
+
+    code_of.cache_clear()
+    monkeypatch.setattr(caching, "method_files", of_changed)
+    monkeypatch.setattr(
+        caching,
+        "_files",
+        lambda place, files=caching._files: [p for p in files(place) if p != owned["svd"][0]],
+    )
+    after = {key: code_of("picture", key) for key in ("svd", "lpca")}
+    code_of.cache_clear()
+    assert after["svd"] != before["svd"]
+    assert after["lpca"] == before["lpca"]
+
+
+def test_results_appear_whole_or_not_at_all(tmp_path):
+    store = Cache(tmp_path / "results")
+    with pytest.raises(RuntimeError):
+        store.write(
+            "key", ".txt", lambda path: (path.write_text("half"), (_ for _ in ()).throw(RuntimeError()))
+        )
+    assert not store.has("key", ".txt")
+    assert list((tmp_path / "results").iterdir()) == []
+    store.write("key", ".txt", lambda path: path.write_text("whole"))
+    assert store.path("key", ".txt").read_text() == "whole"
+
+
+def test_a_missing_reference_fails_every_gate():
+    cell = failed_cell(Spec("checker", "lpca", "sphere", "points2"), "no driver")
+    assert cell.outcome == "fail"
+    assert {gate.gate for gate in cell.gates} == set(GATES)
+    assert not any(gate.passed for gate in cell.gates)
+    assert all("no driver" in gate.detail for gate in cell.gates)
+    assert not Validation([cell], [], QUICK).passed
+    assert not Validation([], [], QUICK).passed
+
+
+def test_eight_bits_are_what_a_display_shows():
+    display = Display(1.0)
+    assert eight_bits(np.array([0.0, 0.5, 7.0]), display) == pytest.approx([0, 0.5, 0.5], abs=1e-6)
+    shown = eight_bits(np.linspace(0, 0.75, 20001), display)
+    assert len(np.unique(shown)) == 256
+
+
+def test_a_picture_that_is_nearly_another_costs_little(rng):
+    reference = rng.random((60, 70, 3))
+    image = reference * (1 + 1e-6 * rng.normal(size=reference.shape))
+    alone, beside = pack(image, bits=6), pack(image, bits=6, base=("reference", reference))
+    assert beside["base"] == "reference"
+    assert len(beside["data"]) < 0.05 * len(alone["data"])
+    packed = pack(reference, bits=6)
+    np.testing.assert_allclose(unpack(beside, packed), image, rtol=2**-6)
+    assert "base" not in pack(5 * image, base=("reference", reference))
+
+
+@pytest.fixture
+def result(rng):
+    """A validation of two cells with made pictures."""
+    cells, size = [], 24
+    classes = np.ones((size, size), np.uint8)
+    classes[:3], classes[3] = 0, 2
+    for key in ("lpca", "svd"):
+        reference = rng.uniform(0.1, 0.9, (size, size, 3)).astype(np.float32) * (classes > 0)[..., None]
+        image = (reference * (1 + 1e-6 * rng.normal(size=reference.shape))).astype(np.float32)
+        truth = reference + 0.02 * rng.normal(size=(4, *reference.shape)) * (classes > 0)[..., None]
+        chain = [("geometry", truth), ("sampled BTF", reference[None] * 1.01), ("fit", reference[None])]
+        chain += [
+            ("port", reference[None]),
+            ("real time", image[None]),
+            ("8 bits", eight_bits(image, Display())[None]),
+        ]
+        fall = waterfall([Picture(*c) for c in chain], classes == 1, Display())
+        spec = Spec("checker", key, "sphere", "points2")
+        images = {"truth": truth.mean(0).astype(np.float32), "reference": reference, "realtime": image}
+        facts = {
+            "name": spec.name,
+            **vars(spec),
+            "waterfall": fall.to_dict(),
+            "image_gates": list(GATES),
+            "gates": [],
+            "notes": fall.explanation,
+            "frame_ms": 2.0 + len(cells),
+        }
+        made = CellResult(facts, images, classes)
+        facts["gates"] = [g.to_dict() for g in (*made.comparison().gates, *fall.gates)]
+        cells.append(made)
+    held = {"seen": {"rmse": 0.1, "mae": 0.1}, "held_out": {"rmse": 0.3, "mae": 0.2}}
+    held |= {"views": [41, 40], "lights": [41, 40]}
+    of_methods = [
+        {
+            "mesostructure": "checker",
+            "method": key,
+            "gates": cells[0].facts["gates"][:1],
+            "held_out": held,
+            "bytes": n,
+        }
+        for key, n in (("lpca", 3000), ("svd", 1000))
+    ]
+    return Validation(cells, of_methods, QUICK, 1.0, 2, 2)
+
+
+def test_a_cell_comes_back_from_its_file(result, tmp_path):
+    cell = result.cells[0]
+    save_cell(tmp_path / "a.cell.npz", cell)
+    again = read_cell(tmp_path / "a.cell.npz")
+    assert again.facts == json.loads(json.dumps(cell.facts))
+    assert again.gates == cell.gates
+    np.testing.assert_array_equal(again.images["truth"], cell.images["truth"])
+
+
+def test_summary_has_a_row_a_method(result):
+    table = [dict(zip(HEADER, row, strict=True)) for row in rows(result)]
+    assert [(r["method"], r["cells"], r["bytes"]) for r in table] == [
+        ("lpca", "1/1", 3000),
+        ("svd", "1/1", 1000),
+    ]
+    fall = result.cells[0].facts["waterfall"]
+    assert table[0]["total"] == pytest.approx(fall["total"]["estimate"] / fall["mean"])
+    assert table[0]["held out"] == 0.2
+
+
+DRIVER = """<script>
+addEventListener("load", async () => {
+  const found = {}, root = document.documentElement;
+  for (let i = 0; i < 200 && root.dataset.ready === undefined && !root.dataset.failed; i++)
+    await new Promise((done) => setTimeout(done, 20));
+  found.ready = root.dataset.ready; found.failed = root.dataset.failed ?? null;
+  found.matrix = root.dataset.matrix ?? null;
+  found.broken = [...document.images].filter((i) => !i.complete || !i.naturalWidth).length;
+  found.images = document.images.length;
+  found.overflow = root.scrollWidth - innerWidth;
+  found.canvases = [...document.querySelectorAll("canvas")].map((c) => c.width > 0);
+  const value = document.getElementById("value");
+  if (value) {
+    const read = () => [...document.querySelectorAll(".matrix .value")].map((v) => v.textContent);
+    found.before = read();
+    value.value = "whole, RMSE / mean"; value.dispatchEvent(new Event("change"));
+    found.after = read();
+    const filter = document.getElementById("filter");
+    filter.value = "checker"; filter.dispatchEvent(new Event("change"));
+    found.rows = [...document.querySelectorAll(".matrix tbody tr")].filter((r) => !r.hidden).length;
+  }
+  const canvas = document.querySelector(".frame.main canvas.a");
+  if (canvas) {
+    const pick = document.querySelector(".pick-a");
+    pick.value = "truth"; pick.dispatchEvent(new Event("change"));
+    found.tag = document.querySelector(".tag-a").textContent;
+    const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+    found.painted = data.some((x, i) => i % 4 !== 3 && x > 0);
+  }
+  const out = document.createElement("pre"); out.id = "found"; out.textContent = JSON.stringify(found);
+  document.body.append(out);
+});
+</script></body>"""
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_the_report_works_from_disk(result, tmp_path, need, width):
+    chromium = need("chromium")
+    index = write_validation(tmp_path / "report", result)
+    pages = [index, *sorted((index.parent / "cells").iterdir())]
+    assert len(pages) == 3
+    for number, page in enumerate(pages[:2]):
+        page.write_text(page.read_text("utf-8").replace("</body>", DRIVER), "utf-8")
+        found, console = browse(chromium, page, tmp_path / f"profile{number}", width)
+        assert console == []
+        assert found["failed"] is None
+        assert found["broken"] == 0
+        assert found["overflow"] <= 0
+        if page == index:
+            assert found["images"] == 2
+            assert found["matrix"] == "ready"
+            assert found["before"] == ["✓", "✓"]
+            assert all(re.fullmatch(r"0\.\d+", text) for text in found["after"])
+            assert found["rows"] == 2
+        else:
+            assert found["ready"] == "1"
+            assert all(found["canvases"])
+            assert found["tag"] == "Geometry truth"
+            assert found["painted"]
+    data = json.loads((index.parent / "validation.json").read_text("utf-8"))
+    assert data["kind"] == "validation"
+    assert data["passed"] is True
+    text = "".join(page.read_text("utf-8") for page in pages)
+    assert not re.search(r'(src|href)="https?:', text)
+
+
+def test_settings_say_how_finely():
+    assert FULL.texels > QUICK.texels
+    assert FULL.size > QUICK.size
