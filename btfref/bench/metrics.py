@@ -53,9 +53,17 @@ def read_records(folder):
 
 
 def latest(records):
-    """The records of the last run of each plan."""
-    runs = {r["plan"]["name"]: r["id"] for r in records if r["record"] == "run"}
-    return [r for r in records if r.get("run", r.get("id")) in runs.values()]
+    """Of each plan and material the records of the last run that measured it, and these runs."""
+    plan = {r["id"]: r["plan"]["name"] for r in records if r["record"] == "run"}
+    # Later runs replace earlier ones.
+    last = {(plan[r["run"]], r["material"]): r["run"] for r in records if r["record"] != "run"}
+    return [
+        r for r in records if (r["id"] in last.values() if r["record"] == "run" else _is_last(r, plan, last))
+    ]
+
+
+def _is_last(record, plan, last):
+    return last[plan[record["run"]], record["material"]] == record["run"]
 
 
 def spread(times):
