@@ -3,21 +3,48 @@
 Errors are taken on linear radiance. --gate names an entry of btfref/compare/tolerances.toml, e.g.
 image.noise_free; without it the errors are reported only. --classes is a file that `btfref render --classes`
 wrote.
+
+With a scene in place of the reference (a Mitsuba scene file, or plane, sphere, cloth) the matching reference is
+rendered, once, and the picture is judged by the gates that fit it: `btfref compare my.exr sphere --method
+checker.lpca.exr -D lights=points2`. A PNG is judged as what 8 bits can show.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from btfref.commands._shared import emit, emit_json, load_classes, number, output_file, table
+from btfref.commands._shared import (
+    assignments,
+    count,
+    emit,
+    emit_json,
+    load_classes,
+    number,
+    output_file,
+    size,
+    table,
+)
+from btfref.errors import InputError
 
 
 def add_arguments(parser):
     """Describe the command's arguments."""
     parser.add_argument("test", metavar="TEST", help="image (EXR or PNG)")
-    parser.add_argument("reference", metavar="REFERENCE", help="image of the same size")
+    parser.add_argument("reference", metavar="REFERENCE", help="image of the same size, or a scene")
     parser.add_argument("--classes", metavar="C.png", help="pixel classes")
     parser.add_argument("--gate", metavar="KEY", help="gate to apply")
+    scene = parser.add_argument_group("when REFERENCE is a scene")
+    scene.add_argument("--method", metavar="FILE|KEY", help="the representation, or a method to fit to --btf")
+    scene.add_argument("--btf", metavar="BTF", help="sampled BTF (.btf.zarr) for --method KEY")
+    scene.add_argument(
+        "-D", dest="define", action="append", metavar="KEY=VALUE", help="parameter of the scene"
+    )
+    scene.add_argument("--size", type=size, metavar="WxH", help="of the film (default: the picture's)")
+    scene.add_argument(
+        "--noise-free", type=count(1), default=4, metavar="N", help="N × N grid per pixel (default: 4)"
+    )
+    scene.add_argument("--shadows", action="store_true", help="the picture has cast shadows")
+    scene.add_argument("--cache", metavar="FOLDER", help="of references (default: the user's cache)")
     parser.add_argument("--json", action="store_true", help="print metrics and gates as JSON")
     parser.add_argument("--report", metavar="OUT.html", help="also write a report")
 
@@ -28,9 +55,19 @@ def run(args):
 
     from btfref.compare import compare, load_image
 
-    test, reference = load_image(args.test), load_image(args.reference)
-    classes = load_classes(args.classes) if args.classes else None
-    comparison = compare(test, reference, classes=classes, gate=args.gate)
+    test = load_image(args.test)
+    if Path(args.reference).suffix.lower() in (".exr", ".png"):
+        for name in ("method", "btf", "define"):
+            if getattr(args, name):
+                raise InputError(
+                    "only scenes are rendered", field=f"--{name}", got=args.reference, expected="a scene"
+                )
+        reference = load_image(args.reference)
+        classes = load_classes(args.classes) if args.classes else None
+        comparison = compare(test, reference, classes=classes, gate=args.gate)
+    else:
+        comparison = _against_scene(args, test)
+        reference = comparison.reference.astype("float32")
     if report:
         from btfref.report import Cell, write_report
         from btfref.versions import versions
@@ -45,6 +82,26 @@ def run(args):
         for line in lines(comparison):
             emit(line)
     return 0 if comparison.passed else 1
+
+
+def _against_scene(args, test):
+    """The comparison with the reference of a scene."""
+    from btfref.validate.own_renderer import judge_image, reference_of, representation_for
+
+    if args.classes:
+        raise InputError("a scene has its own pixel classes", field="--classes", got=args.classes)
+    parameters = assignments(args.define, convert=str, option="-D")
+    if args.method:
+        parameters["btf"] = str(representation_for(args.method, args.btf, cache=args.cache))
+    found = reference_of(
+        args.reference,
+        parameters=parameters,
+        size=args.size or (test.shape[1], test.shape[0]),
+        grid=args.noise_free,
+        shadows=args.shadows,
+        cache=args.cache,
+    )
+    return judge_image(args.test, found, gates=args.gate)
 
 
 def lines(comparison):

@@ -4,9 +4,11 @@ import json
 import re
 from dataclasses import replace
 
+import jsonschema
 import numpy as np
 import pytest
 from browser import browse
+from schemas import assert_follows_schema
 
 from btfref.compare.colour import Display
 from btfref.compare.waterfall import Picture, waterfall
@@ -162,6 +164,17 @@ def test_a_cell_comes_back_from_its_file(result, tmp_path):
     assert again.facts == json.loads(json.dumps(cell.facts))
     assert again.gates == cell.gates
     np.testing.assert_array_equal(again.images["truth"], cell.images["truth"])
+
+
+def test_results_follow_the_schema(result):
+    data = result.to_dict()
+    assert_follows_schema(data)
+    assert_follows_schema(
+        Validation([failed_cell(Spec("checker", "lpca", "a", "b"), "why")], [], QUICK).to_dict()
+    )
+    del data["cells"][0]["gates"][0]["reason"]
+    with pytest.raises(jsonschema.ValidationError):
+        assert_follows_schema(data)
 
 
 def test_summary_has_a_row_a_method(result):

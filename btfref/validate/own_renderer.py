@@ -1,0 +1,191 @@
+"""Other people's renderers: the matching reference of a scene, cached, and the gates for a picture of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from btfref.compare import compare, load_image
+from btfref.errors import InputError
+from btfref.scenes import scene_file
+from btfref.validate.cache import Cache, code_of, key_of
+
+#: Gates of a picture of linear radiance under delta lights; of one with 8 bits; of one under an environment.
+LINEAR = ("image.noise_free", "image.silhouette", "image.mesostructure", "image.background")
+EIGHT_BIT = ("image.eight_bit", "image.eight_bit_silhouette")
+NOISY = ("image.equivalence",)
+
+#: Samples per pixel of the reference where it cannot be free of noise.
+SPP = 1024
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """What a picture is judged by.
+
+    Parameters
+    ----------
+    image : ndarray of float32, shape (H, W, 3)
+    classes : ndarray of uint8, shape (H, W)
+    variance : ndarray of float32, shape (H, W, 3), or None
+        None where the reference has no noise.
+    cached : bool
+        Whether it was there already.
+    """
+
+    image: np.ndarray
+    classes: np.ndarray
+    variance: np.ndarray | None
+    cached: bool = False
+
+
+def reference_of(scene, *, parameters=None, size=None, grid=4, shadows=False, spp=SPP, cache=None):
+    """The reference picture of a scene, rendered once.
+
+    Parameters
+    ----------
+    scene : path-like
+        A Mitsuba scene file, or the name of a shipped scene.
+    parameters : dict of str to str, optional
+        Values for ``$name`` in the file.
+    size : (int, int), optional
+        Width and height in place of the scene's.
+    grid : int
+        n of the n × n sub-pixel samples under delta lights, which leave no noise.
+    shadows : bool
+        Cast shadows, under delta lights.
+    spp : int
+        Samples per pixel where other lights need random numbers.
+    cache : path-like, optional
+
+    Returns
+    -------
+    Reference
+
+    Raises
+    ------
+    InputError
+        For a scene that cannot be read.
+    """
+    from btfref.render.scene import read_scene
+
+    path, parameters = scene_file(scene), dict(parameters or {})
+    description = read_scene(path, parameters, size=size)
+    files = {m.material.filename for m in description.meshes if m.material}
+    facts = {
+        "scene": path.read_text("utf-8"),
+        "parameters": {k: v for k, v in parameters.items() if not Path(v).exists()},
+        "files": sorted(
+            _digest(name) for name in files | {v for v in parameters.values() if Path(v).is_file()}
+        ),
+        "size": size,
+        "delta": description.environment is None,
+        "settings": [grid, shadows] if description.environment is None else [spp],
+        "code": code_of("picture"),
+    }
+    store, key = Cache(cache), key_of({"reference": facts})
+    there = store.has(key, ".reference.npz")
+    if not there:
+        made = _render(path, parameters, size, grid, shadows, spp, facts["delta"])
+        store.write(key, ".reference.npz", lambda target: np.savez_compressed(target, **made))
+    with np.load(store.path(key, ".reference.npz")) as stored:
+        variance = stored["variance"] if "variance" in stored.files else None
+        return Reference(stored["image"], stored["classes"], variance, there)
+
+
+def _render(path, parameters, size, grid, shadows, spp, delta):
+    from btfref.render.classes import pixel_classes
+    from btfref.render.reference import render
+
+    shared = {"parameters": parameters, "size": size}
+    made = {"classes": pixel_classes(path, grid=grid, **shared)}
+    if delta:
+        return made | {"image": render(path, noise_free=grid, shadows=shadows, **shared).image}
+    result = render(path, spp=spp, with_variance=True, **shared)
+    return made | {"image": result.image, "variance": result.variance}
+
+
+def _digest(name):
+    import hashlib
+
+    with open(name, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def judge_image(image, reference, *, gates=None, flip=True):
+    """Compare a picture with a reference by the gates that fit it.
+
+    Parameters
+    ----------
+    image : path-like or (H, W, 3) array
+        Linear radiance; a ``.png`` is decoded from sRGB and judged as what 8 bits can show, clipped at 1.
+    reference : Reference
+    gates : str or sequence of str, optional
+        In place of those that are chosen by the kind of picture and of reference.
+    flip : bool
+
+    Returns
+    -------
+    btfref.compare.Comparison
+
+    Raises
+    ------
+    InputError
+        Unreadable pictures, another size, unknown gates.
+    """
+    eight_bit = not isinstance(image, np.ndarray) and Path(image).suffix.lower() == ".png"
+    test = image if isinstance(image, np.ndarray) else load_image(image)
+    if test.shape != reference.image.shape:
+        raise InputError(
+            "the picture and the scene's film differ in size",
+            file=None if isinstance(image, np.ndarray) else image,
+            got=f"{test.shape[1]}x{test.shape[0]}",
+            expected=f"{reference.image.shape[1]}x{reference.image.shape[0]} (--size chooses another)",
+        )
+    if gates is None:
+        gates = NOISY if reference.variance is not None else EIGHT_BIT if eight_bit else LINEAR
+    expected = np.clip(reference.image, 0, 1) if eight_bit else reference.image
+    return compare(
+        test, expected, classes=reference.classes, gate=gates, variance=reference.variance, flip=flip
+    )
+
+
+def representation_for(method, btf=None, *, cache=None):
+    """A file of a method: the file itself, or the key of a method that is fitted to a sampled BTF, once.
+
+    Parameters
+    ----------
+    method : str
+        ``FILE.exr``, or a key of the registry.
+    btf : path-like, optional
+        Sampled BTF for a key.
+    cache : path-like, optional
+
+    Returns
+    -------
+    pathlib.Path
+
+    Raises
+    ------
+    InputError
+        A key without a BTF, or an unknown one.
+    """
+    from btfref.registry import method as row
+    from btfref.representations import save
+    from btfref.sampling import SampledBTF, open_store
+
+    if str(method).endswith(".exr"):
+        return Path(method)
+    found = row(method)
+    if btf is None:
+        expected = "a .btf.zarr, or a file of the method"
+        raise InputError("a method needs a BTF to be fitted to", field="--btf", expected=expected)
+    store = Cache(cache)
+    key = key_of({"fit": found.key, "btf": open_store(btf).info(), "code": code_of("fit", found.key)})
+    suffix = f".{found.key}.exr"
+    if not store.has(key, suffix):
+        made = found.fit(SampledBTF.load(btf, variance=False))
+        store.write(key, suffix, lambda path: save(made, path))
+    return store.path(key, suffix)
