@@ -13,7 +13,10 @@ from btfref.errors import InputError
 #: Longer lists are counted; --json has them all.
 MOST_LISTED = 16
 
-_BYTES = ("payload_bytes", "file_bytes", "raw_bytes", "eigen_bytes", "weight_bytes")
+_BYTES = (
+    *("payload_bytes", "file_bytes", "raw_bytes", "eigen_bytes", "weight_bytes"),
+    *("float_bytes", "half_bytes", "code_bytes", "published_bytes"),
+)
 
 
 def add_arguments(parser):

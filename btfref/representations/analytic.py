@@ -160,6 +160,33 @@ def fit_report(representation, btf):
     return {"average": float(error.mean()), "minimum": float(error.min()), "maximum": float(error.max())}
 
 
+#: Bytes a texel and view of reflectance fields that Meseth et al. report: about 365 MB for 256² texels and 81 views.
+PUBLISHED_BYTES = 365e6 / (256 * 256 * 81)
+
+
+def memory_report(maps, texels, n_views=None):
+    """JSON-able bytes of a method's maps by the type of their numbers.
+
+    Parameters
+    ----------
+    maps : dict of str to ndarray
+        Without the direction tables.
+    texels : int
+    n_views : int, optional
+        Of a reflectance field: adds what the paper reports for as many texels and views.
+
+    Returns
+    -------
+    dict
+        ``float_bytes``, ``half_bytes``, ``code_bytes`` (8 bits, where they hold); ``published_bytes``.
+    """
+    numbers = sum(int(array.size) for array in maps.values())
+    result = {"float_bytes": 4 * numbers, "half_bytes": 2 * numbers, "code_bytes": numbers}
+    if n_views is not None:
+        result["published_bytes"] = round(PUBLISHED_BYTES * texels * n_views)
+    return result
+
+
 class AnalyticMaps(StoredMaps):
     """Maps of a method that has ``luminance_tables(texels, views) -> (n, n_views, n_lights)``."""
 

@@ -220,7 +220,8 @@ def fit(btf, *, seed=0, progress=None, lobes=4, storage="half", filter_type="bil
     -------
     Representation
         ``meta["fit"]`` holds ``epsilon`` (see :func:`analytic.fit_report`), the counts of
-        :attr:`btfref.numerics.levenberg.BatchFit.summary` and ``not_converged_at``, up to 1000 texels.
+        :attr:`btfref.numerics.levenberg.BatchFit.summary` ``not_converged_at``, up to 1000 texels,
+        and ``memory`` (see :func:`analytic.memory_report`).
 
     Raises
     ------
@@ -266,5 +267,6 @@ def fit_texels(method, btf, fit_block, parameters, progress, storage, filter_typ
     meta = base_meta(method, btf, parameters, filter_type=filter_type)
     meta["constants"] = analytic.edge_constants(btf) | {"n_lobes": parameters["lobes"]}
     failed = np.flatnonzero(~everything.converged)
-    meta["fit"] = everything.summary | {"not_converged_at": failed[:1000].tolist()}
+    memory = analytic.memory_report(maps, rows * columns)
+    meta["fit"] = everything.summary | {"not_converged_at": failed[:1000].tolist(), "memory": memory}
     return maps | direction_arrays(btf.views, btf.lights), meta

@@ -200,7 +200,8 @@ def fit(
     -------
     Representation
         ``meta["fit"]`` holds ``epsilon`` (see :func:`analytic.fit_report`), the counts of
-        :attr:`btfref.numerics.levenberg.BatchFit.summary`, and ``not_converged_at``: up to 1000 pairs (texel, view).
+        :attr:`btfref.numerics.levenberg.BatchFit.summary`, ``not_converged_at``: up to 1000 pairs (texel, view),
+        and ``memory`` (see :func:`analytic.memory_report`).
 
     Raises
     ------
@@ -237,6 +238,7 @@ def fit(
     meta["fit"] = merged(summaries) | {
         "not_converged_at": failed[:1000],
         "epsilon": analytic.fit_report(result, btf),
+        "memory": analytic.memory_report(maps, rows * columns, n_views),
     }
     return result
 

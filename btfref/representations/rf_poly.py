@@ -101,7 +101,8 @@ def fit(btf, *, seed=0, progress=None, storage="half", filter_type="bilinear"):
     Returns
     -------
     Representation
-        ``meta["fit"]`` holds ``epsilon`` (see :func:`analytic.fit_report`), ``rank`` and ``condition``.
+        ``meta["fit"]`` holds ``epsilon`` (see :func:`analytic.fit_report`), ``rank`` and ``condition``,
+        ``memory`` (see :func:`analytic.memory_report`).
 
     Raises
     ------
@@ -123,5 +124,6 @@ def fit(btf, *, seed=0, progress=None, storage="half", filter_type="bilinear"):
     meta = base_meta("rf_poly", btf, {"storage": storage, "seed": seed}, filter_type=filter_type)
     meta["constants"] = analytic.edge_constants(btf)
     result = Representation(maps | direction_arrays(btf.views, btf.lights), meta)
-    meta["fit"] = conditioning | {"epsilon": analytic.fit_report(result, btf)}
+    memory = analytic.memory_report(maps, rows * columns, n_views)
+    meta["fit"] = conditioning | {"epsilon": analytic.fit_report(result, btf), "memory": memory}
     return result

@@ -164,3 +164,15 @@ def test_other_numbers_of_lobes(need, rng, lobes):
     fitted = method("rf_lobes").fit(btf, lobes=lobes)
     for gate in agreement(probe(fitted, uv, *w), fitted.evaluate(uv, *w)).gates:
         assert gate.passed, gate.line
+
+
+@pytest.mark.parametrize(("key", "numbers"), [("rf_lobes", 81 * 8 + 4), ("rf_poly", 81 * 6 + 3)])
+def test_memory_is_counted(fits, key, numbers):
+    """Numbers a texel: with 256² of them, the paper's 365 MB stand beside 170.9 and 128.2 MB in floats."""
+    memory = fits(key).meta["fit"]["memory"]
+    texels = 16 * 12
+    assert (
+        memory["float_bytes"] == 2 * memory["half_bytes"] == 4 * memory["code_bytes"] == 4 * texels * numbers
+    )
+    assert memory["published_bytes"] == round(365e6 * texels / 65536)
+    assert fits("lafortune").meta["fit"]["memory"]["half_bytes"] == 2 * texels * 24
