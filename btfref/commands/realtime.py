@@ -5,7 +5,7 @@ cast shadows: compare with `btfref render --no-shadows`. The image is the mean o
 
 --environment says how an envmap lights: "prefiltered" maps, for the methods that have them, "lights", directional
 lights that stand for it, for any method, or "auto", the first of these that there is; "sh", spherical harmonics, for
-methods whose texels share tables (lpca).
+methods whose texels share tables (lpca); "transfer", these after transfer through the mesh, with its own shadows.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from btfref.commands._shared import (
     size,
     write_images,
 )
+from btfref.errors import InputError
 from btfref.render.paths import PATHS
 from btfref.scenes import scene_file
 
@@ -53,8 +54,33 @@ def add_arguments(parser):
         "--order", type=count(1), metavar="N", help="bands of spherical harmonics (default 5)"
     )
     parser.add_argument("--window", choices=("none", "hanning", "lanczos"), help="that damps their ringing")
+    parser.add_argument(
+        "--transfer",
+        nargs="+",
+        action="extend",
+        metavar="KEY=VALUE",
+        help="clusters, components, shadows (0 or 1), bounces and bits (8 or 32) of the transfer",
+    )
     parser.add_argument("--png", action="store_true", help="also write X.png, for eyes")
     parser.add_argument("--json", action="store_true", help="print frame time and OpenGL renderer as JSON")
+
+
+def transfer_settings(items):
+    """``KEY=VALUE`` as :class:`btfref.render.transfer.TransferSettings`."""
+    from dataclasses import fields
+
+    from btfref.render.transfer import TransferSettings
+
+    given = assignments(items, option="--transfer")
+    known = [field.name for field in fields(TransferSettings)]
+    for name in given:
+        if name not in known:
+            raise InputError(
+                "no such setting of the transfer", field="--transfer", got=name, expected=", ".join(known)
+            )
+    if "shadows" in given:
+        given["shadows"] = bool(given["shadows"])
+    return TransferSettings(**given)
 
 
 def run(args):
@@ -74,6 +100,7 @@ def run(args):
         lights=args.lights,
         order=args.order,
         window=args.window,
+        transfer=transfer_settings(args.transfer) if args.transfer else None,
     )
     write_images(result.image, out, png=args.png)
     if args.json:

@@ -36,7 +36,7 @@ def approximate(scene, *, parameters=None, path="auto", grid=4, size=None, load_
     load_file : callable, optional
         ``path -> Representation``; the default reads the files.
     **options
-        ``lights``, ``order`` and ``window`` as for ``realtime``.
+        ``lights``, ``order``, ``window`` and ``transfer`` as for ``realtime``.
 
     Returns
     -------
@@ -64,10 +64,13 @@ def approximate(scene, *, parameters=None, path="auto", grid=4, size=None, load_
         name = points.material.filename
         if name not in reps:
             reps[name] = (load_file or representations.load)(name)
-            if lighting is not None:
-                prepared[name] = lighting.prepared(reps[name], file=name)
         rep = _filtered(reps[name], points.material.filter_type)
-        value = _radiance(rep, points, description.lights, prepared.get(name))
+        if lighting is not None:
+            key = (name, points.mesh) if lighting.per_mesh else name
+            if key not in prepared:
+                prepared[key] = lighting.prepared(rep, file=name, mesh=points.mesh)
+        mesh = description.meshes[points.mesh]
+        value = _radiance(rep, points, mesh, description.lights, prepared[key] if lighting else None)
         total[points.pixel] += points.material.scale * value
     camera = description.camera
     if total is None:
@@ -84,7 +87,7 @@ def approximate(scene, *, parameters=None, path="auto", grid=4, size=None, load_
     if len(facts) == 1:
         meta |= facts[0]
     elif facts:
-        meta["environment_path"] = dict(zip(prepared, facts, strict=True))
+        meta["environment_path"] = dict(zip(map(str, prepared), facts, strict=True))
     return RenderResult(image.astype(np.float32), None, meta)
 
 
@@ -96,7 +99,7 @@ def _filtered(representation, filter_type):
     return type(representation).from_arrays(representation.arrays(), meta)
 
 
-def _radiance(representation, points, lights, prepared):
+def _radiance(representation, points, mesh, lights, prepared):
     """Radiance towards the viewer without the material's factor, shape (N, 3)."""
 
     def evaluate(uv, w_light, w_view, at):
@@ -126,5 +129,7 @@ def _radiance(representation, points, lights, prepared):
         w_light = np.einsum("ni,nij->nj", towards, points.to_world)
         total += power * evaluate(points.uv, w_light, points.w_view, everywhere)
     if prepared is not None:
-        total += prepared.radiance(points.uv, points.w_view, points.to_world, evaluate)
+        total += prepared.radiance(
+            points.uv, points.w_view, points.to_world, evaluate, lambda: points.place(mesh)
+        )
     return total

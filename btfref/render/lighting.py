@@ -1,8 +1,8 @@
 """Ways to light a representation by an environment: one place that knows which there are and what each needs.
 
-``lights`` works for every method; ``prefiltered`` where the registry names a class for it; ``sh`` where texels share
-tables over lights. A way that is made ready for a representation holds a GLSL file with ``btf_environment``, the tables
-that it reads, and the same approximation in float64.
+``lights`` works for every method; ``prefiltered`` where the registry names a class for it; ``sh`` and ``transfer``
+where texels share tables over lights. A way that is made ready for a representation holds a GLSL file with
+``btf_environment``, the tables that it reads, and the same approximation in float64.
 """
 
 from __future__ import annotations
@@ -12,12 +12,19 @@ from functools import cached_property
 
 import numpy as np
 
+from btfref.conventions import luminance
 from btfref.errors import InputError
 from btfref.numerics import harmonics
 from btfref.registry import image_light, methods
-from btfref.render import harmonic_light
+from btfref.render import harmonic_light, transfer_light
+from btfref.render.environment import constant
 from btfref.render.light_set import light_set
 from btfref.render.paths import PATHS
+from btfref.render.shapes import neighbours
+from btfref.render.transfer import TransferSettings, clustered, corner_matrices, vertex_transfer
+
+#: Lookups whose mean is the albedo of a material.
+ALBEDO_SAMPLES = 512
 
 #: Values of B evaluated at a time in float64.
 BLOCK = 1 << 18
@@ -36,13 +43,17 @@ class Prepared:
     tables : dict of str to ndarray
         That the file reads, beside the representation's own.
     radiance : callable
-        ``(uv (N, 2), w_view (N, 3), to_world (N, 3, 3), evaluate=None) -> (N, 3)`` in float64. ``evaluate(uv, w_light,
-        w_view, point)`` stands for the representation's own where points have levels of detail: ``point`` are their
-        indices.
+        ``(uv (N, 2), w_view (N, 3), to_world (N, 3, 3), evaluate=None, place=None) -> (N, 3)`` in float64.
+        ``evaluate(uv, w_light, w_view, point)`` stands for the representation's own where points have levels of detail:
+        ``point`` are their indices. ``place()`` gives triangles (N,) and barycentric coordinates (N, 3).
     facts : dict
         JSON-able: for the picture's ``meta``.
     constants : dict
         Of the GLSL file.
+    bins : ndarray of int, shape (n + 1,), or None
+        Where the triangles of each of n pictures that add up begin, in the table ``bin_triangles``.
+    transfer : btfref.render.transfer_light.TransferLight or None
+        What can be lit anew.
     """
 
     path: str
@@ -51,6 +62,8 @@ class Prepared:
     radiance: object
     facts: dict = field(default_factory=dict)
     constants: dict = field(default_factory=dict)
+    bins: np.ndarray | None = None
+    transfer: object = None
 
 
 class Lighting:
@@ -59,13 +72,17 @@ class Lighting:
     Parameters
     ----------
     environment : btfref.render.environment.Environment
-    path : {"auto", "prefiltered", "lights", "sh"}
+    path : {"auto", "prefiltered", "lights", "sh", "transfer"}
     lights : int, optional
         Of the path "lights"; see :func:`btfref.render.light_set.light_set`.
     order : int
-        Bands of spherical harmonics of the path "sh".
+        Bands of spherical harmonics of the paths "sh" and "transfer".
     window : {"none", "hanning", "lanczos"}, optional
         That damps their ringing.
+    meshes : sequence of MeshDescription
+        Of the scene, for the path "transfer".
+    transfer : btfref.render.transfer.TransferSettings, optional
+        Of that path.
 
     Raises
     ------
@@ -73,7 +90,17 @@ class Lighting:
         For an unknown way.
     """
 
-    def __init__(self, environment, path="auto", *, lights=None, order=harmonic_light.ORDER, window=None):
+    def __init__(
+        self,
+        environment,
+        path="auto",
+        *,
+        lights=None,
+        order=harmonic_light.ORDER,
+        window=None,
+        meshes=(),
+        transfer=None,
+    ):
         if path not in PATHS:
             raise InputError(
                 "unknown way to light", field="environment", got=repr(path), expected=", ".join(PATHS)
@@ -83,6 +110,7 @@ class Lighting:
         self.environment, self.path, self._count = environment, path, lights
         self._order, self._window = harmonics.checked_order(order), window
         harmonics.window(window, order)
+        self._meshes, self._transfer = tuple(meshes), transfer or TransferSettings()
 
     @cached_property
     def light_set(self):
@@ -92,9 +120,40 @@ class Lighting:
     @cached_property
     def coefficients(self):
         """The environment in spherical harmonics, world space, shape (order², 3)."""
-        return harmonic_light.environment_coefficients(self.environment, self._order, window=self._window)
+        return self.coefficients_of(self.environment)
 
-    def prepared(self, representation, *, file=None):
+    def coefficients_of(self, environment):
+        """Another environment, likewise."""
+        return harmonic_light.environment_coefficients(environment, self._order, window=self._window)
+
+    @property
+    def per_mesh(self):
+        """Whether every mesh is prepared on its own."""
+        return self.path == "transfer"
+
+    @cached_property
+    def _vertex_transfer(self):
+        """Of all meshes, or None where nothing hides the environment."""
+        settings = self._transfer
+        if not settings.shadows:
+            return None
+        albedo = [self._albedo(mesh) if settings.bounces else 0.0 for mesh in self._meshes]
+        return vertex_transfer(self._meshes, self._order, bounces=settings.bounces, albedo=albedo)
+
+    def _albedo(self, mesh):
+        """Mean luminance of a material under radiance 1, over texels and views."""
+        from btfref import representations
+
+        rep = representations.load(mesh.material.filename)
+        rng = np.random.default_rng(0)
+        uv, w_view = rng.random((ALBEDO_SAMPLES, 2)), rng.normal(size=(ALBEDO_SAMPLES, 3))
+        w_view[:, 2] = np.abs(w_view[:, 2]) + 0.1
+        w_view /= np.linalg.norm(w_view, axis=1, keepdims=True)
+        frame = np.broadcast_to(np.eye(3), (ALBEDO_SAMPLES, 3, 3))
+        white = Lighting(constant(), "sh", order=1).prepared(rep)
+        return mesh.material.scale * float(luminance(white.radiance(uv, w_view, frame)).mean())
+
+    def prepared(self, representation, *, file=None, mesh=None):
         """The way for a representation.
 
         Parameters
@@ -102,6 +161,8 @@ class Lighting:
         representation : Representation
         file : str, optional
             For messages.
+        mesh : int, optional
+            Index of the mesh that it is on, where each is prepared on its own.
 
         Returns
         -------
@@ -117,21 +178,23 @@ class Lighting:
             key = representation.meta["method"]
             prefiltered = methods()[key].image_light if key in methods() else ""
             path = "prefiltered" if prefiltered and self._count is None else "lights"
-        return getattr(self, f"_{path}")(representation, file)
+        if path == "transfer":
+            return self._by_transfer(representation, file, mesh)
+        return getattr(self, f"_by_{path}")(representation, file)
 
-    def _prefiltered(self, representation, file):
+    def _by_prefiltered(self, representation, file):
         light = image_light(representation.meta["method"], file=file)
         tables = light.tables(representation, self.environment)
 
-        def radiance(uv, w_view, to_world, evaluate=None):
+        def radiance(uv, w_view, to_world, evaluate=None, place=None):
             return light.radiance(representation, tables, uv, w_view, to_world)
 
         return Prepared("prefiltered", light.SHADER, tables, radiance)
 
-    def _lights(self, representation, file):
+    def _by_lights(self, representation, file):
         found = self.light_set
 
-        def radiance(uv, w_view, to_world, evaluate=None):
+        def radiance(uv, w_view, to_world, evaluate=None, place=None):
             evaluate = evaluate or (
                 lambda uv, w_light, w_view, _: representation.evaluate(uv, w_light, w_view)
             )
@@ -152,12 +215,12 @@ class Lighting:
         tables = {"environment_lights": found.table()}
         return Prepared("lights", "environment/lights.glsl", tables, radiance, facts)
 
-    def _sh(self, representation, file):
+    def _by_sh(self, representation, file):
         order, light = self._order, self.coefficients
         found = harmonic_light.table_coefficients(representation, order, file=file)
         stored = found.astype(np.float32)
 
-        def radiance(uv, w_view, to_world, evaluate=None):
+        def radiance(uv, w_view, to_world, evaluate=None, place=None):
             return harmonic_light.radiance(representation, stored, light, uv, w_view, to_world)
 
         tables = {
@@ -174,6 +237,53 @@ class Lighting:
         shader = representation.harmonic_shader
         return Prepared("sh", shader, tables, radiance, facts, {"HARMONIC_ORDER": order})
 
+    def _by_transfer(self, representation, file, number):
+        mesh, settings, order = self._meshes[number], self._transfer, self._order
+        material = transfer_light.Material(representation, order, file=file)
+        vertices = self._vertex_transfer
+        matrices = corner_matrices(mesh, order, None if vertices is None else vertices[number])
+        transfer = clustered(matrices, settings)
+        two_sided = mesh.material.twosided
+        light = transfer_light.TransferLight(
+            material, transfer, self.coefficients, two_sided=two_sided, bits=settings.bits
+        )
+        triangles, starts = transfer_light.bins(transfer, neighbours(mesh.positions, mesh.faces))
+
+        def radiance(uv, w_view, to_world, evaluate=None, place=None):
+            return light.radiance(uv, w_view, np.linalg.det(to_world) < 0, *place())
+
+        tables = {
+            **light.tables(),
+            "transfer_corners": transfer_light.corner_table(transfer),
+            "transfer_clusters": light.places(),
+            "bin_triangles": triangles,
+        }
+        facts = {
+            "order": order,
+            "window": self._window or "none",
+            "environment_shadows": settings.shadows,
+            "bounces": settings.bounces,
+            "matrix_clusters": len(transfer.basis),
+            "matrix_components": transfer.basis.shape[1] - 1,
+            "matrix_error": transfer.error,
+            "material_clusters": len(material.present),
+            "bits": settings.bits,
+            "table_bytes": light.table_bytes,
+            "lambda_ms": light.milliseconds,
+            "ringing": harmonics.ringing(self.coefficients, order),
+            "estimated_error": harmonic_light.estimated_error(self.environment, self.coefficients),
+        }
+        constants = {
+            "HAS_BINS": True,
+            "TRANSFER_BITS": settings.bits,
+            "TRANSFER_SIZE": transfer_light.SIZE,
+            "TRANSFER_SIDES": 2 if two_sided else 1,
+            "TRANSFER_CLUSTERS": len(transfer.basis),
+            "TRANSFER_MATERIALS": len(material.present),
+        }
+        shader = representation.transfer_shader
+        return Prepared("transfer", shader, tables, radiance, facts, constants, starts, light)
+
 
 def lighting_of(scene, path="auto", **options):
     """The :class:`Lighting` of a scene's environment, or None without one.
@@ -187,4 +297,12 @@ def lighting_of(scene, path="auto", **options):
     """
     if scene.environment is None:
         return None
-    return Lighting(scene.environment, path, **{k: v for k, v in options.items() if v is not None})
+    if path == "transfer" and scene.lights:
+        raise InputError(
+            "transferred light is the environment's alone",
+            file=scene.source,
+            field="emitter",
+            got=len(scene.lights),
+        )
+    given = {k: v for k, v in options.items() if v is not None}
+    return Lighting(scene.environment, path, meshes=scene.meshes, **given)

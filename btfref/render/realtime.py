@@ -9,6 +9,7 @@ projection; frames are added in float64.
 from __future__ import annotations
 
 import time
+from itertools import pairwise
 
 import numpy as np
 
@@ -17,9 +18,9 @@ from btfref.demand import MARGIN, kept_directions
 from btfref.errors import BtfrefError, InputError
 from btfref.render import gl
 from btfref.render.lighting import lighting_of
+from btfref.render.raster import clip_planes, light_uniforms, lod_uniforms, triangle_table, world_to_clip
 from btfref.render.result import RenderResult
 from btfref.render.scene import SceneDescription, read_scene
-from btfref.render.shapes import neighbours
 
 
 def realtime(
@@ -33,6 +34,7 @@ def realtime(
     lights=None,
     order=None,
     window=None,
+    transfer=None,
     count_fetches=False,
 ):
     """Render a scene with OpenGL.
@@ -57,6 +59,8 @@ def realtime(
         Bands of spherical harmonics; default 5.
     window : {"none", "hanning", "lanczos"}, optional
         That damps their ringing.
+    transfer : btfref.render.transfer.TransferSettings, optional
+        Of the way "transfer".
     count_fetches : bool
         Count the texels that the representations fetch: ``meta["fetches"]``, the mean over covered samples.
 
@@ -93,7 +97,7 @@ def realtime(
     def load_needed(path):
         return representations.load(path, **needed[path])
 
-    lighting = lighting_of(scene, environment, lights=lights, order=order, window=window)
+    lighting = lighting_of(scene, environment, lights=lights, order=order, window=window, transfer=transfer)
     load_file = load_needed if needed else None
     with Renderer(scene, load_file, lighting=lighting, count_fetches=count_fetches) as renderer:
         offsets = [((i + 0.5) / grid, (j + 0.5) / grid) for j in range(grid) for i in range(grid)]
@@ -175,16 +179,16 @@ class Renderer:
             )
         colour = self._own(self.ctx.texture(size, 4, dtype="f4"))
         self._target = self._own(self.ctx.framebuffer([colour], self._own(self.ctx.depth_renderbuffer(size))))
-        self._near, self._far = _clip(self.camera, scene.meshes)
-        self._lights = _light_uniforms(scene.lights) if scene.lights else {}
+        self._near, self._far = clip_planes(self.camera, scene.meshes)
+        self._lights = light_uniforms(scene.lights) if scene.lights else {}
         self._n_lights, self._lighting = len(scene.lights), lighting
         if lighting is None:
             self._lighting = lighting_of(scene)
-        self._light_facts = {}
+        self._light_facts, self._depth = {}, None
         self._counting = {"COUNT_FETCHES": 1} if count_fetches else {}
         try:
-            for mesh in scene.meshes:
-                self._add(mesh, load_file or representations.load)
+            for number, mesh in enumerate(scene.meshes):
+                self._add(number, mesh, load_file or representations.load)
         except BaseException:
             self.release()
             raise
@@ -199,14 +203,15 @@ class Renderer:
         self._owned.append(thing)
         return thing
 
-    def _add(self, mesh, load_file):
+    def _add(self, number, mesh, load_file):
         material = mesh.material
-        key = (material.filename, material.filter_type)
+        own = number if self._lighting is not None and self._lighting.per_mesh else None
+        key = (material.filename, material.filter_type, own)
         if key not in self._shown:
             rep = load_file(material.filename)
             light = None
             if self._lighting is not None:
-                light = self._lighting.prepared(rep, file=material.filename)
+                light = self._lighting.prepared(rep, file=material.filename, mesh=own)
                 self._light_facts[material.filename] = {"environment_path": light.path, **light.facts}
             shown = gl.ShaderRepresentation.upload(
                 self.ctx, rep, filter_type=material.filter_type, light=light
@@ -214,9 +219,16 @@ class Renderer:
             defines = {"N_LIGHTS": self._n_lights, **self._counting}
             program = shown.program(self.ctx, "hosts/mesh.vert", "hosts/mesh.frag", defines=defines)
             self._own(program), self._own(shown)
-            self._shown[key] = shown, program, self._own(self.ctx.vertex_array(program, []))
+            self._shown[key] = shown, program, self._own(self.ctx.vertex_array(program, [])), light
         table = self._own(gl.upload(self.ctx, triangle_table(mesh), "triangles"))
         self._meshes.append((mesh, key, table))
+
+    def _depth_program(self):
+        """Black surfaces: what fills the depth buffer before pictures are added up."""
+        if self._depth is None:
+            program = self._own(gl.compile_program(self.ctx, "hosts/mesh.vert", "hosts/depth.frag"))
+            self._depth = program, self._own(self.ctx.vertex_array(program, []))
+        return self._depth
 
     def draw(self, offset=(0.5, 0.5), *, share=1.0):
         """Draw a frame.
@@ -254,15 +266,26 @@ class Renderer:
         start = time.perf_counter()
         query = ctx.query(time=True)
         with query:
+            if any(light is not None and light.bins is not None for *_, light in self._shown.values()):
+                self._fill_depth(common)
             for mesh, key, table in self._meshes:
-                shown, program, vertices = self._shown[key]
+                shown, program, vertices, light = self._shown[key]
                 gl.bind(program, {**shown.textures, "triangles": table})
                 row0, row1 = mesh.material.to_uv
                 own = {"uv_row0": row0, "uv_row1": row1, "scale": mesh.material.scale}
                 own["uv_rotation"] = mesh.material.rotation
                 own |= lod_uniforms(mesh.material, shown.texels, share * camera.pixel_angle)
                 gl.set_uniforms(program, {**common, **own, "two_sided": mesh.material.twosided})
-                vertices.render(ctx.TRIANGLES, vertices=3 * len(mesh.faces))
+                if light is None or light.bins is None:
+                    vertices.render(ctx.TRIANGLES, vertices=3 * len(mesh.faces))
+                    continue
+                # Each cluster of matrices is a picture; they add up.
+                gl.set_uniforms(program, {"transfer_components": light.transfer.table.shape[3]})
+                for number, (first, end) in enumerate(pairwise(light.bins.tolist())):
+                    gl.set_uniforms(program, {"bin": number, "bin_first": first})
+                    vertices.render(ctx.TRIANGLES, vertices=3 * (end - first))
+        ctx.depth_func = "<"
+        ctx.disable(ctx.BLEND)
         ctx.finish()
         return max(1e-6 * query.elapsed, 1e3 * (time.perf_counter() - start))
 
@@ -272,6 +295,41 @@ class Renderer:
         if len(self._light_facts) == 1:
             return next(iter(self._light_facts.values()))
         return {"environment_path": dict(self._light_facts)} if self._light_facts else {}
+
+    def _fill_depth(self, common):
+        """Draw all surfaces black; what follows adds to what is nearest."""
+        ctx = self.ctx
+        program, vertices = self._depth_program()
+        for mesh, _, table in self._meshes:
+            gl.bind(program, {"triangles": table})
+            gl.set_uniforms(program, common)
+            vertices.render(ctx.TRIANGLES, vertices=3 * len(mesh.faces))
+        ctx.depth_func = "<="
+        ctx.enable(ctx.BLEND)
+        ctx.blend_func = ctx.ONE, ctx.ONE
+
+    def relight(self, environment, *, moving=False):
+        """Light all by another environment through the matrices that are there (way "transfer" only).
+
+        Parameters
+        ----------
+        environment : btfref.render.environment.Environment
+        moving : bool
+            Few components of matrices and materials, as while a light is dragged; the next call without it refines.
+
+        Raises
+        ------
+        InputError
+            When the scene is lit in another way.
+        """
+        if self._lighting is None or not self._lighting.per_mesh:
+            raise InputError("only transferred light changes", field="environment", expected="transfer")
+        coefficients = self._lighting.coefficients_of(environment)
+        for shown, _, _, light in self._shown.values():
+            light.transfer.relight(coefficients, moving=moving)
+            for name, table in light.transfer.tables().items():
+                shown.textures.pop(name).release()
+                shown.textures[name] = gl.upload(self.ctx, table, name)
 
     def read(self):
         """The frame, float32 (H, W, 3), row 0 at the top."""
@@ -287,92 +345,3 @@ class Renderer:
         """Give everything on the GPU back."""
         while self._owned:
             self._owned.pop().release()
-
-
-def lod_uniforms(material, texels, angle):
-    """What ``shaders/lib/lod.glsl`` reads.
-
-    Parameters
-    ----------
-    material : BtfMaterial
-    texels : (int, int)
-        Rows and columns of level 0.
-    angle : float
-        That a sample subtends, in radians.
-    """
-    return {
-        "lod_angle": angle if material.lod == "auto" else 0.0,
-        "lod_unit": material.lod_unit if material.lod == "distance" else 0.0,
-        "lod_bias": material.lod_bias,
-        "lod_texels": np.array(texels[::-1], float),
-    }
-
-
-def triangle_table(mesh):
-    """Triangles as ``shaders/lib/triangle_table.glsl`` reads them.
-
-    Parameters
-    ----------
-    mesh : MeshDescription
-
-    Returns
-    -------
-    ndarray of float32, shape (m, 8, 4)
-        Three positions with u, three normals with v, dp/du, neighbours.
-    """
-    positions, normals, uv, dp_du = mesh.corners()
-    if len(positions) > 1 << 24:
-        raise InputError("too many triangles for float32 indices", field=mesh.name, got=len(positions))
-    table = np.zeros((len(positions), 8, 4), np.float32)
-    table[:, 0:3, :3], table[:, 0:3, 3] = positions, uv[..., 0]
-    table[:, 3:6, :3], table[:, 3:6, 3] = normals, uv[..., 1]
-    # Only the direction counts; unit length keeps float32 far from overflow.
-    table[:, 6, :3] = dp_du / np.linalg.norm(dp_du, axis=-1, keepdims=True)
-    table[:, 7, :3] = neighbours(mesh.positions, mesh.faces)
-    return table
-
-
-def world_to_clip(camera, offset, near, far):
-    """Projection that puts the film point at ``offset`` in each pixel on that pixel's centre.
-
-    Parameters
-    ----------
-    camera : Camera
-    offset : (float, float)
-        From the pixel's top left corner, in pixels.
-    near, far : float
-
-    Returns
-    -------
-    ndarray of float64, shape (4, 4)
-    """
-    to_world = camera.to_world.copy()
-    to_world[:3, :3] /= np.linalg.norm(to_world[:3, :3], axis=0)
-    tan_x, tan_y = camera.tangents
-    shift_x = 2 * (0.5 - offset[0]) / camera.width
-    shift_y = -2 * (0.5 - offset[1]) / camera.height
-    project = np.array(
-        [
-            # Mitsuba's camera space is left, up, forward.
-            [-1 / tan_x, 0, shift_x, 0],
-            [0, 1 / tan_y, shift_y, 0],
-            [0, 0, (far + near) / (far - near), -2 * far * near / (far - near)],
-            [0, 0, 1, 0],
-        ]
-    )
-    return project @ np.linalg.inv(to_world)
-
-
-def _clip(camera, meshes):
-    """Near and far planes around the scene: the depth buffer then resolves what is there."""
-    depths = [camera.depth(mesh.positions[mesh.faces.ravel()]) for mesh in meshes if len(mesh.faces)]
-    if not depths:
-        return camera.near, camera.far
-    low, high = min(d.min() for d in depths), max(d.max() for d in depths)
-    near = max(camera.near, 0.99 * low)
-    return near, max(min(camera.far, 1.01 * high), 1.01 * near)
-
-
-def _light_uniforms(lights):
-    position = [[*light.position, 0.0 if light.kind == "directional" else 1.0] for light in lights]
-    return {"light_position": np.array(position), "light_power": np.array([light.power for light in lights])}

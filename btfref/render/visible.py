@@ -10,6 +10,20 @@ from btfref.errors import InputError
 from btfref.numerics.footprint import TINY, cone_footprint
 from btfref.representations import read_info
 
+#: Shapes whose triangles are a tessellation of ours.
+ANALYTIC = ("sphere", "disk", "cylinder")
+
+
+def _barycentric(corners, position):
+    """Coordinates of points in the planes of triangles; (3, 3) or (N, 3, 3), (N, 3) -> (N, 3)."""
+    a, b, c = np.moveaxis(corners, -2, 0)
+    e1, e2, d = b - a, c - a, position - a
+    normal = np.cross(e1, e2)
+    square = (normal * normal).sum(-1)
+    v = (np.cross(d, e2) * normal).sum(-1) / square
+    w = (np.cross(e1, d) * normal).sum(-1) / square
+    return np.stack([1 - v - w, v, w], -1)
+
 
 @dataclass(frozen=True)
 class Points:
@@ -49,6 +63,34 @@ class Points:
     to_world: np.ndarray
     triangle: np.ndarray
     footprint: tuple
+
+    def place(self, mesh):
+        """Triangle and barycentric coordinates of every point.
+
+        Parameters
+        ----------
+        mesh : MeshDescription
+            The points' own.
+
+        Returns
+        -------
+        triangle : ndarray of int, shape (N,)
+        barycentric : ndarray of float64, shape (N, 3)
+
+        Raises
+        ------
+        InputError
+            For a curved shape that is no mesh: its triangles are not those that the camera sees.
+        """
+        corners = np.asarray(mesh.positions, float)[mesh.faces]
+        if mesh.plugin == "rectangle":
+            every = [_barycentric(corners[k], self.position) for k in range(len(corners))]
+            triangle = np.argmax([b.min(1) for b in every], axis=0)
+        elif mesh.plugin in ANALYTIC:
+            raise InputError("a mesh is needed", field=mesh.name, got=mesh.plugin, expected="such as ply")
+        else:
+            triangle = self.triangle.astype(np.int64)
+        return triangle, _barycentric(corners[triangle], self.position)
 
 
 def visible_points(scene, description, *, parameters=None, size=None, grid=4):

@@ -54,11 +54,18 @@ void main() {
 #ifdef HAS_ENVIRONMENT
     mat3 to_world = transpose(to_local);
     to_world[2] *= side;
+#ifdef HAS_BINS
+    transfer_triangle = point.triangle;
+    transfer_barycentric = point.barycentric;
+#endif
     sum += btf_environment(uv, w_view, to_world, lod);
 #endif
 #ifdef COUNT_FETCHES
     // Instead of coverage: the texels that the representation fetched.
     radiance = vec4(scale * sum, float(fetches));
+#elif defined(HAS_BINS)
+    // Coverage comes from the pass that drew the depth: bins add up.
+    radiance = vec4(scale * sum, 0.0);
 #else
     radiance = vec4(scale * sum, 1.0);
 #endif

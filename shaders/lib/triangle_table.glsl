@@ -13,6 +13,8 @@ struct SurfacePoint {
     vec3 plane_normal;  // of the triangle, unit length
     vec3 gradient_u;    // change of u and v per unit length in the triangle's plane
     vec3 gradient_v;
+    int triangle;       // and the place in it
+    vec3 barycentric;
 };
 
 // Barycentric coordinates of the point where a ray meets a triangle's plane (Moeller and Trumbore 1997, eq. 6).
@@ -72,5 +74,7 @@ SurfacePoint scene_intersect(sampler2DArray triangles, int rasterized, vec3 orig
     s.gradient_u = uv1.x * of_b + uv2.x * of_c;
     s.gradient_v = uv1.y * of_b + uv2.y * of_c;
     s.plane_normal = area * inversesqrt(squared);
+    s.triangle = triangle;
+    s.barycentric = at_point;
     return s;
 }

@@ -28,9 +28,8 @@ GATES = {
 #: In the default run.
 QUICK = {
     ("lpca", "cloth", "bright-texel"),
-    ("raw", "plane", "constant"),
     ("cmf", "sphere", "bright-texel"),
-    ("rf_poly", "sphere", "constant"),
+    ("rf_poly", "plane", "bright-texel"),
 }
 
 

@@ -1,0 +1,203 @@
+"""Clustered transfer: GLSL against float64, shadows and light between meshes against the path tracer."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from btfref.compare import compare
+from btfref.compare.tolerances import tolerance
+from btfref.errors import InputError
+from btfref.numerics import harmonics
+from btfref.numerics.quadrature import gauss_hemisphere
+from btfref.render import transfer_light
+from btfref.render.approximate import approximate
+from btfref.render.classes import pixel_classes
+from btfref.render.environments import harmonic_environment
+from btfref.render.lighting import lighting_of
+from btfref.render.realtime import Renderer, realtime
+from btfref.render.reference import render
+from btfref.render.scene import Light, read_scene
+from btfref.render.shapes import neighbours
+from btfref.render.transfer import TransferSettings, clustered, corner_matrices, vertex_transfer
+from btfref.scenes import scene_file
+
+SIZE = (32, 32)
+
+
+@pytest.fixture(autouse=True)
+def _renderers(need):
+    need("llvm"), need("gl")
+
+
+def parameters(fits, environment="harmonics", **more):
+    return {"btf": str(fits.path("lpca")), "lights": "envmap", "environment": environment, **more}
+
+
+def described(fits, name, **more):
+    return read_scene(scene_file(name), parameters(fits, **more), size=SIZE)
+
+
+@pytest.mark.parametrize(
+    ("scene", "settings"),
+    [
+        ("cloth", TransferSettings(clusters=6, components=3, bits=8)),
+        pytest.param(
+            "bowl",
+            TransferSettings(clusters=12, components=5, shadows=True, bounces=1),
+            marks=pytest.mark.long,
+        ),
+        ("plane", TransferSettings()),
+    ],
+)
+def test_pictures_equal_float64(fits, scene, settings):
+    """Both sides, boundaries between clusters, codes and floats."""
+    options = {"parameters": parameters(fits), "grid": 1, "size": SIZE, "order": 3, "transfer": settings}
+    image = realtime(scene_file(scene), environment="transfer", **options)
+    exact = approximate(scene_file(scene), path="transfer", **options)
+    classes = pixel_classes(scene_file(scene), parameters=parameters(fits), grid=1, size=SIZE)
+    found = compare(image, exact, classes=classes, gate="image.float64", flip=False)
+    assert found.passed, [gate.line for gate in found.gates]
+    facts = ("matrix_clusters", "table_bytes", "bits", "environment_shadows", "bounces")
+    assert {k: image.meta[k] for k in facts} == {k: exact.meta[k] for k in facts}
+    assert image.meta["environment_shadows"] == settings.shadows
+    if scene == "plane":
+        # One frame, one matrix: nothing else is computed.
+        assert image.meta["matrix_clusters"] == 1
+
+
+def test_the_table_of_the_paper(fits):
+    """32 matrix clusters × (8 + 1) × 16 material clusters × (4 + 1) × 16² × 3 bytes."""
+    scene = described(fits, "bowl")
+    light = lighting_of(scene, "transfer", transfer=TransferSettings(bits=8))
+    rep = fits("lpca")
+    prepared = light.prepared(rep, mesh=0)
+    assert prepared.facts["material_clusters"] == 16
+    assert prepared.facts["table_bytes"] == 17_694_720
+    assert prepared.tables["transfer_products"].nbytes == 17_694_720
+
+
+def test_nothing_hidden_is_the_rotation(fits):
+    scene = described(fits, "plane")
+    (found,) = vertex_transfer(scene.meshes, 4)
+    np.testing.assert_array_equal(found, np.broadcast_to(np.eye(16, dtype=np.float32), found.shape))
+
+
+def test_a_closed_surface_hides_the_half_behind_it(fits):
+    """The matrices of a sphere: products of harmonics over a hemisphere."""
+    mesh = described(fits, "sphere").meshes[0]
+    (found,) = vertex_transfer([mesh], 3)
+    w, weight = gauss_hemisphere(32, 64)
+    at = np.flatnonzero(mesh.positions[:, 2] > 0.999)[0]
+    y = harmonics.values(w, 3)
+    expected = y.T @ (y * weight[:, None])
+    assert np.abs(found[at] - expected).max() <= tolerance("transfer.visibility")
+
+
+def test_large_scale_shadows(fits):
+    """A bowl against the path tracer that hides the sky by the bowl, with shadows in the matrices and without."""
+    file, own = scene_file("bowl"), parameters(fits)
+    settings = {"parameters": own, "size": SIZE, "grid": 1}
+    inside = pixel_classes(file, **settings) == 1
+    reference = render(file, spp=1024, seed=2, **settings)
+    noise = np.mean(reference.variance[inside])
+
+    def error(transfer):
+        image = realtime(file, environment="transfer", transfer=transfer, **settings).image
+        square = np.mean((image - reference.image)[inside] ** 2) - noise
+        return np.sqrt(max(square, 0)) / reference.image[inside].mean()
+
+    assert error(TransferSettings(shadows=True)) <= tolerance("transfer.shadows")
+    assert error(TransferSettings()) > 5 * tolerance("transfer.shadows")
+
+
+@pytest.mark.long
+def test_light_from_wall_to_wall(fits):
+    """One bounce by the materials' mean albedo brings the picture nearer to two bounces of the path tracer."""
+    file = scene_file("bowl")
+    settings = {"size": SIZE, "parameters": parameters(fits)}
+    deeper = settings | {"parameters": parameters(fits, depth="3")}
+    inside = pixel_classes(file, grid=2, **settings) == 1
+    reference = render(file, spp=512, seed=2, **deeper).image[inside].mean(0)
+
+    def mean(bounces):
+        transfer = TransferSettings(shadows=True, bounces=bounces)
+        image = realtime(file, environment="transfer", transfer=transfer, grid=2, **settings).image
+        return image[inside].mean(0)
+
+    without, with_one = mean(0), mean(1)
+    assert with_one.sum() > without.sum()
+    assert abs(with_one.sum() - reference.sum()) < 0.5 * abs(without.sum() - reference.sum())
+
+
+def test_more_clusters_and_components_compress_less(fits):
+    mesh = described(fits, "bowl").meshes[0]
+    matrices = corner_matrices(mesh, 3)
+    errors = [
+        clustered(matrices, TransferSettings(clusters=k, components=c)).error
+        for k, c in ((2, 2), (8, 2), (8, 6))
+    ]
+    assert errors[0] > errors[1] > errors[2]
+    transfer = clustered(matrices, TransferSettings(clusters=8, components=6))
+    rebuilt = np.einsum("tcj,tcjab->tcab", transfer.weights, transfer.basis[transfer.cluster])
+    found = np.sqrt(((rebuilt - matrices) ** 2).sum() / (matrices**2).sum())
+    assert found == pytest.approx(transfer.error, rel=1e-3)
+
+
+def test_bins_hold_every_triangle_of_their_clusters(fits):
+    mesh = described(fits, "bowl").meshes[0]
+    transfer = clustered(corner_matrices(mesh, 2), TransferSettings(clusters=5, components=2))
+    table, starts = transfer_light.bins(transfer, neighbours(mesh.positions, mesh.faces))
+    assert len(starts) == len(transfer.basis) + 1
+    for k in range(len(transfer.basis)):
+        own = set(table[starts[k] : starts[k + 1], 0].astype(int).tolist())
+        assert set(np.flatnonzero((transfer.cluster == k).any(1)).tolist()) <= own
+        assert len(own) < len(mesh.faces)
+
+
+def test_codes_are_half_a_step_off(rng):
+    table = rng.normal(size=(3, 1, 2, 4, 2, 5, 3)).astype(np.float32)
+    table[:, :, :, 1:] *= 0.01
+    codes, scales = transfer_light.encoded(table)
+    assert scales[1, 0] < 0.1 * scales[0, 0]
+    difference = np.abs(transfer_light.decoded(codes, scales) - table)
+    for a, j in enumerate((slice(0, 1), slice(1, None))):
+        for b, m in enumerate((slice(0, 1), slice(1, None))):
+            step = scales[a, b] / transfer_light.LEVELS
+            assert difference[:, :, :, j, :, :, m].max() <= 0.5001 * step
+
+
+def test_a_moving_light_is_coarse_and_then_refined(fits):
+    """The renderer's own way: few components at first, then what a fresh start would show."""
+    scene = described(fits, "bowl")
+    other = harmonic_environment(seed=3)[0]
+    options = {"transfer": TransferSettings(clusters=6), "order": 3}
+    with Renderer(scene, lighting=lighting_of(scene, "transfer", **options)) as renderer:
+        renderer.draw()
+        first = renderer.read().copy()
+        renderer.relight(other, moving=True)
+        renderer.draw()
+        coarse = renderer.read().copy()
+        renderer.relight(other)
+        renderer.draw()
+        refined = renderer.read().copy()
+    light = lighting_of(scene, "transfer", **options)
+    light.environment = other
+    with Renderer(scene, lighting=light) as renderer:
+        renderer.draw()
+        fresh = renderer.read()
+        np.testing.assert_allclose(refined, fresh, rtol=1e-5, atol=1e-6)
+    change = np.abs(fresh - first).mean()
+    assert 0 < np.abs(coarse - fresh).mean() < 0.5 * change
+    plain = lighting_of(scene, "sh")
+    with Renderer(scene, lighting=plain) as renderer, pytest.raises(InputError, match="transfer"):
+        renderer.relight(other)
+
+
+def test_settings_are_checked(fits):
+    for wrong in ({"clusters": 0}, {"bits": 16}, {"bounces": 1}, {"components": 2.5}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            TransferSettings(**wrong)
+    lit = replace(described(fits, "plane"), lights=(Light("point", np.zeros(3), np.ones(3)),))
+    with pytest.raises(InputError, match="emitter"):
+        lighting_of(lit, "transfer")
