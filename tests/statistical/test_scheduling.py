@@ -53,6 +53,21 @@ def test_workers_write_the_same_bytes(tmp_path, cluster, extra):
 
 
 @pytest.mark.filterwarnings("default")
+def test_a_cluster_that_runs_elsewhere_is_reached_by_its_address(tmp_path, cluster):
+    address = cluster.scheduler.address
+    assert address.startswith("tcp://")
+    alone, shared = tmp_path / "alone.btf.zarr", tmp_path / "shared.btf.zarr"
+    synthesize_store(alone, "flat", texels=4, views="1x3", lights="1x3", spp=4, estimator="surface")
+    command = ["synth", "flat", "-o", str(shared), "--texels", "4", "--views", "1x3", "--lights", "1x3"]
+    command += ["--spp", "4", "--estimator", "surface", "--scheduler", address]
+    before = cluster.run(os.getpid)
+    assert main(command) == 0
+    assert _files(alone) == _files(shared)
+    # The cluster is somebody else's: it goes on.
+    assert cluster.run(os.getpid) == before
+
+
+@pytest.mark.filterwarnings("default")
 def test_a_killed_worker_loses_nothing(tmp_path, cluster):
     settings = SETTINGS | {"spp": 64, "texels": 32}
     alone, shared = tmp_path / "alone.btf.zarr", tmp_path / "shared.btf.zarr"

@@ -90,27 +90,97 @@ def test_white_furnace(estimator, spp):
     assert (1 - albedo(256, 2) > 5 * limit).all()
 
 
-def test_tile_means_are_reciprocal_and_texels_are_not():
+@pytest.mark.parametrize(("estimator", "spp", "runs"), [("path", 256, 1), ("surface", 16, 12)])
+def test_tile_means_are_reciprocal_and_texels_are_not(estimator, spp, runs):
     """The tile's mean f is reciprocal (Snyder 1998), that of a texel is not (Suykens et al. 2003, fig. 2)."""
     vectors = directions("ubo81").vectors[[0, 22, 44, 66]]
     tile = _faceted(build("checker", resolution=32, raised_roughness=0.3))
-    btf = synthesize(tile, texels=8, views=vectors, lights=vectors, spp=256, dtype="float32", seed=11)
-    cosine = vectors[:, 2]
-    f = btf.values.astype(np.float64) / cosine[:, None, None, None]
-    variance = btf.variance / cosine[:, None, None, None] ** 2
+    settings = {"texels": 8, "views": vectors, "lights": vectors, "spp": spp, "dtype": "float32"}
+    made = [synthesize(tile, seed=11 + run, estimator=estimator, **settings) for run in range(runs)]
+    cosine = vectors[:, 2][:, None, None, None]
+    f = np.stack([btf.values / cosine for btf in made]).astype(np.float64)
     upper = np.triu_indices(4, 1)
     p = []
     for v, k in zip(*upper, strict=True):
+        difference = f[:, v, k] - f[:, k, v]
+        if runs > 1:
+            # A pair and its reverse share points and walks: what whole runs differ by holds what goes together.
+            means = difference.mean((1, 2, 3))
+            p.append(welch_test(means.mean(), means.var(ddof=1) / runs, 0.0, 0.0, n_a=runs)[1])
+            continue
         # A pair and its reverse are independent: their views are traced with other random numbers.
-        interval = bias_interval(f[v, k] - f[k, v], variance[v, k] + variance[k, v])
+        variance = (made[0].variance / cosine**2)[[v, k], [k, v]].sum(0)
+        interval = bias_interval(difference[0], variance)
         p.append(welch_test(interval.estimate, interval.standard_error**2, 0.0, 0.0)[1])
     assert difference_test(np.array(p), significance=tolerance("synthesis.z.significance")).rejected == 0
-    texel_p = welch_test(f[upper], variance[upper], f.swapaxes(0, 1)[upper], variance.swapaxes(0, 1)[upper])[
-        1
-    ]
-    assert (
-        difference_test(texel_p, significance=tolerance("synthesis.z.significance")).rejected_fraction > 0.5
+    there, back = f[:, upper[0], upper[1]], f[:, upper[1], upper[0]]
+    if runs > 1:
+        gap = there - back
+        texels = gap.mean(0), gap.var(0, ddof=1) / runs, np.zeros(gap.shape[1:]), 0.0
+        texel_p = welch_test(*texels, n_a=runs)[1]
+    else:
+        variance = made[0].variance / cosine**2
+        texel_p = welch_test(there[0], variance[upper], back[0], variance.swapaxes(0, 1)[upper])[1]
+    rejected = difference_test(texel_p, significance=tolerance("synthesis.z.significance"))
+    assert rejected.rejected_fraction > 0.5
+
+
+def _groove():
+    """Lambertian V-groove along y with walls of 45 degrees, its edges at x = 0 and x = 1, its bottom at x = ½."""
+    vertices = np.array([[x, y, -z] for x, z in ((0, 0), (0.5, 0.5), (1, 0)) for y in (0, 1)], np.float64)
+    faces = np.array([[0, 2, 3], [0, 3, 1], [2, 4, 5], [2, 5, 3]])
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    part = Part(
+        corners.reshape(-1, 3),
+        np.arange(12).reshape(-1, 3),
+        {"type": "diffuse", "reflectance": 0.5},
+        normals=np.repeat(normal, 3, 0),
     )
+    return Mesostructure("groove", {}, (part,))
+
+
+@pytest.mark.parametrize(("estimator", "spp"), [("path", 256), ("surface", 256)])
+def test_shadow_of_a_v_groove(estimator, spp):
+    """Direct light in the groove, seen from above, has a closed form.
+
+    A light (s, t, c) meets the left wall, normal (1, 0, 1)/√2, at cosine (s + c)/√2. A ray from its point
+    (x, −x) passes under the right edge (1, 0) where (1 − x) c < x s: the wall is in shadow beyond
+    x = c/(s + c). The right wall, normal (−1, 0, 1)/√2, is lit at cosine (c − s)/√2 when that is positive.
+    """
+    n, thetas = 16, (0.5, 1.0, 1.1)
+    lights = [
+        [sign * np.sin(t) * np.cos(0.4), np.sin(t) * np.sin(0.4), np.cos(t)]
+        for t in thetas
+        for sign in (1, -1)
+    ]
+    btf = synthesize(
+        _groove(), texels=n, views=[[0.0, 0.0, 1.0]], lights=lights, spp=spp, max_depth=2, dtype="float32",
+        estimator=estimator, seed=4,
+    )  # fmt: skip
+    p = []
+    for k, (x, _, c) in enumerate(lights):
+        s, lower = abs(x), np.arange(n) / n
+        lit = np.clip((c / (s + c) - lower) * n, 0.0, 1.0)
+        expected = np.where(lower < 0.5, lit * (s + c), max(c - s, 0.0)) * 0.5 / np.pi / np.sqrt(2)
+        expected = expected if x > 0 else expected[::-1]
+        found = btf.values[0, k, :, :, 0].astype(np.float64)
+        border = (lit > 0) & (lit < 1) & (lower < 0.5)
+        border = border if x > 0 else border[::-1]
+        assert border.sum() == (c < s)
+        error = np.abs(found - expected)[:, ~border].max() / expected.max()
+        assert error <= tolerance("synthesis.flat_eval")
+        if not border.any():
+            continue
+        # Rows are samples of the texel that the shadow's border crosses.
+        mean, spread = found[:, border].mean(0), found[:, border].var(0, ddof=1) / n
+        p.append(welch_test(mean, spread, expected[border], 0.0, n_a=n)[1])
+        # It could tell a border that is off by a tenth of a texel.
+        assert (3 * np.sqrt(spread) < 0.1 * expected.max()).all()
+    p = np.concatenate(p)
+    assert len(p) == 4
+    assert difference_test(p, significance=tolerance("synthesis.z.significance")).rejected == 0
 
 
 @pytest.mark.parametrize("spp", [64, 27, 25])
