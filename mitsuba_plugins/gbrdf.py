@@ -51,7 +51,7 @@ class Evaluator:
         # Tables are looked up with any length: a normalisation less is a rounding less near the horizon.
         facet = mi.Vector3f(dr.dot(h, tangent), dr.dot(h, bitangent), dr.dot(h, normal))
         light, view = dr.maximum(cos_light, 0), dr.maximum(dr.dot(w_view, normal), 0)
-        factor = light / dr.maximum(dr.fma(-light, view, light + view), 1e-30)
+        factor = light / dr.maximum(dr.fma(view, 1 - light, light), 1e-30)
         factor = dr.select(facet.z > 0, factor, 0)
         grazing = 1 - dr.clip(dr.dot(w_light, h) / dr.maximum(length, 1e-30), 0, 1)
         fifth = dr.square(dr.square(grazing)) * grazing

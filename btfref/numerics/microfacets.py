@@ -43,7 +43,8 @@ def geometry_factor(cos_light, cos_view):
         Without a singularity: for k1·n > 0 the denominator is at least k1·n.
     """
     light, view = np.maximum(cos_light, 0), np.maximum(cos_view, 0)
-    denominator = light + view - light * view
+    # In this form no rounding takes it below the light's cosine, nor the factor beyond 1.
+    denominator = light + view * (1 - light)
     return np.where(light > 0, light / np.where(light > 0, denominator, 1), 0.0)
 
 

@@ -59,7 +59,7 @@ vec3 btf_eval(vec2 uv, vec3 w_light, vec3 w_view, float lod) {
     vec3 h = normalize(w_light + w_view);
     vec3 facet = frame * h;
     // The denominator is at least k1.n > 0; microfacets behind the surface reflect nothing.
-    float factor = facet.z > 0.0 ? light / (light + view - light * view) : 0.0;
+    float factor = facet.z > 0.0 ? light / (light + view * (1.0 - light)) : 0.0;
     float grazing = 1.0 - clamp(dot(w_light, h), 0.0, 1.0);
     float fifth = grazing * grazing * grazing * grazing * grazing;
     Stencil half_stencil = parabolic_stencil(facet, NDF_DIM1);

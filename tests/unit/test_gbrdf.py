@@ -290,3 +290,32 @@ def test_photograph(rng, tmp_path):
 def test_bad_maps_name_the_field(rng, changes, field):
     with pytest.raises(InputError, match=field):
         edited(rng, **changes)
+
+
+def test_the_denominator_at_grazing_is_bounded(rng):
+    """k1·n + k2·n − (k1·n)(k2·n) → 0: the factor stays in [0, 1] in float32 and float64, down to subnormal cosines."""
+    smallest = np.float32(1e-45)
+    for kind in (np.float32, np.float64):
+        cosines = np.array([0, smallest, 1e-38, 1e-20, 1e-7, 1e-3, 0.5, 1, -1e-7, -1], kind)
+        light, view = (a.ravel() for a in np.meshgrid(cosines, cosines))
+        with np.errstate(under="ignore"):
+            factor = geometry_factor(light, view)
+        assert np.isfinite(factor).all()
+        assert ((factor >= 0) & (factor <= 1)).all()
+        # Seen from along the surface all light counts, from above its cosine.
+        np.testing.assert_allclose(factor[(view <= 0) & (light > 0)], 1)
+        np.testing.assert_allclose(
+            factor[(view == 1) & (light > 1e-37)], light[(view == 1) & (light > 1e-37)]
+        )
+    for u, r0 in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        assert schlick(u, r0) == (1 if u == 0 else r0)
+    w_light, w_view = hemisphere(rng, 4000).astype(float), hemisphere(rng, 4000).astype(float)
+    for w in (w_light, w_view):
+        w[:, 2] *= 10 ** rng.uniform(-12, 0, 4000)
+        w /= np.linalg.norm(w, axis=1, keepdims=True)
+    for fresnel in (0.0, 1.0):
+        value = edited(rng, fresnel=fresnel, height_min=0.0, height_max=0.0).evaluate(
+            [0.3, 0.6], w_light, w_view
+        )
+        assert np.isfinite(value).all()
+        assert (value >= 0).all()
