@@ -9,7 +9,7 @@ from __future__ import annotations
 #: Suites by name.
 SUITES = {
     "demand": "btfref.bench.demand",
-    "environment": "btfref.bench.environment",
+    "env": "btfref.bench.env",
     "factors": "btfref.bench.factors",
     "gbrdf": "btfref.bench.gbrdf",
     "lobes": "btfref.bench.lobes",

@@ -35,7 +35,9 @@ def add_arguments(parser):
         metavar="FOLDER|FILE.jsonl",
         help="raw results: a folder for plans (and for the report), a file to append a line to for suites",
     )
-    parser.add_argument("--plot", metavar="FILE.png", help="draw how the cost grows (suite synth)")
+    parser.add_argument(
+        "--plot", metavar="FILE.png", help="draw how the cost (suite synth) or the error (env) grows"
+    )
     parser.add_argument(
         "--report", metavar="FILE.html", help="a page with the pictures, of suites that have any"
     )
@@ -135,9 +137,9 @@ def _suite(args):
 
     out = output_file(args.output, ".jsonl") if args.output else None
     plot = output_file(args.plot, ".png") if args.plot else None
-    if plot and args.suite != "synth":
-        raise InputError("only the suite synth is drawn", field="--plot", got=args.suite, expected="synth")
     suite = importlib.import_module(SUITES[args.suite])
+    if plot and args.suite != "synth" and not hasattr(suite, "plot"):
+        raise InputError("this suite has no plot", field="--plot", got=args.suite, expected="env or synth")
     options = {"only": _only(args)} if args.only else {}
     if args.report:
         options["report"] = output_file(args.report, ".html")
@@ -151,9 +153,12 @@ def _suite(args):
         with Path(out).open("a") as stream:
             stream.write(json.dumps(result) + "\n")
     if plot:
-        from btfref.report.growth_plot import plot_growth
+        if hasattr(suite, "plot"):
+            suite.plot(result, plot)
+        else:
+            from btfref.report.growth_plot import plot_growth
 
-        plot_growth(result["growth"], plot)
+            plot_growth(result["growth"], plot)
     if args.json:
         emit_json(result)
         return 0

@@ -290,6 +290,12 @@ class Renderer:
         return max(1e-6 * query.elapsed, 1e3 * (time.perf_counter() - start))
 
     @property
+    def transfers(self):
+        """What can be lit anew, one :class:`btfref.render.transfer_light.TransferLight` a mesh."""
+        lights = [light for *_, light in self._shown.values()]
+        return [light.transfer for light in lights if light is not None and light.transfer is not None]
+
+    @property
     def environment_facts(self):
         """How the environment lights: the facts of one file, or facts by file where there are several."""
         if len(self._light_facts) == 1:

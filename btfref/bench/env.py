@@ -1,0 +1,251 @@
+"""Light from environments: what each approximation costs in accuracy, memory and time.
+
+Errors are of pictures: prefiltered maps and spherical harmonics against the path tracer, whose noise is taken out;
+clusters, components and codes of the transfer against spherical harmonics per pixel, which they compress.
+"""
+
+from __future__ import annotations
+
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from btfref.bench.timing import machine
+from btfref.scenes import scene_file
+
+#: Pictures are small: the noise of their references averages out over the sphere.
+SIZE, GRID = (32, 32), 2
+
+ENVIRONMENTS = ("harmonics", "studio", "sky", "bright-texel")
+
+ORDERS = range(2, 11)
+
+CLUSTERS, COMPONENTS = (4, 8, 16, 32, 64), (1, 2, 4, 8, 16)
+
+#: Rounds of the timings; the first one, which allocates, is apart.
+ROUNDS = 9
+
+#: Frames of this size are timed.
+FRAME = (800, 800)
+
+
+def run(*, quick=False, progress=None, btf=None, only=None):
+    """Error against order, clusters, components and bits; time of the products and of frames.
+
+    Parameters
+    ----------
+    quick : bool
+        Every other order, two environments, smaller frames.
+    progress : callable, optional
+    btf : SampledBTF, optional
+        Default: a checker of 32² texels.
+    only : sequence of str, optional
+        Some of "prefiltered", "order", "transfer", "time".
+
+    Returns
+    -------
+    dict
+        ``summary``: by table, rows of numbers; ``raw``: times; ``machine``.
+    """
+    from btfref.bench.data import checker
+    from btfref.registry import methods
+    from btfref.representations import save
+
+    parts = {"prefiltered": _prefiltered, "order": _order, "transfer": _transfer, "time": _time}
+    btf = btf or checker(texels=32, spp=8, progress=progress)
+    summary, raw = {}, {}
+    with tempfile.TemporaryDirectory() as folder:
+
+        def fitted(key):
+            path = Path(folder) / f"bench.{key}.exr"
+            if not path.exists():
+                save(methods()[key].fit(btf), path)
+            return path
+
+        for done, (name, part) in enumerate(parts.items()):
+            if progress:
+                progress(done, len(parts), name)
+            if only is None or name in only:
+                summary[name], raw[name] = part(fitted, quick)
+    parameters = {"size": list(SIZE), "grid": GRID, "shape": list(btf.values.shape)}
+    return {"suite": "env", "parameters": parameters, "raw": raw, "summary": summary, "machine": machine()}
+
+
+def _scene(path, scene, environment):
+    parameters = {"btf": str(path), "lights": "envmap", "environment": environment}
+    return scene_file(scene), {"parameters": parameters, "size": SIZE, "grid": GRID}
+
+
+def _inside(file, settings):
+    from btfref.render.classes import pixel_classes
+
+    return pixel_classes(file, **settings) == 1
+
+
+def _error(image, reference, inside):
+    """Noise-corrected relative RMSE with its 99 % interval."""
+    from btfref.compare import significance
+
+    difference = image.image[inside].astype(float) - reference.image[inside]
+    mse = significance.mse_interval(difference, reference.variance[inside].astype(float), confidence=0.99)
+    found, scale = significance.rmse_interval(mse), float(reference.image[inside].mean())
+    return {"rmse": found.estimate / scale, "low": found.low / scale, "high": found.high / scale}
+
+
+def _prefiltered(fitted, quick):
+    """Every method with prefiltered maps, on a sphere."""
+    from btfref.registry import methods
+    from btfref.render.converged import converged
+    from btfref.render.realtime import realtime
+
+    rows, raw = [], []
+    for key in [k for k, row in methods().items() if row.image_light]:
+        for environment in ENVIRONMENTS[: 2 if quick else None]:
+            start = time.perf_counter()
+            file, settings = _scene(fitted(key), "sphere", environment)
+            inside = _inside(file, settings)
+            reference = converged(file, inside, gate="image.environment", shadows=False, **settings)
+            image = realtime(file, environment="prefiltered", **settings)
+            found = _error(image, reference, inside)
+            facts = {"spp": reference.meta["spp"], "noise": reference.meta["noise"]}
+            rows.append({"method": key, "environment": environment, **found, **facts})
+            raw.append(time.perf_counter() - start)
+    return rows, raw
+
+
+def _order(fitted, quick):
+    """Spherical harmonics of each order on a sphere, with and without a window, and lights for comparison."""
+    from btfref.render.converged import converged
+    from btfref.render.realtime import realtime
+
+    rows, raw = [], []
+    for environment in ENVIRONMENTS[: 2 if quick else None]:
+        file, settings = _scene(fitted("lpca"), "sphere", environment)
+        inside = _inside(file, settings)
+        start = time.perf_counter()
+        reference = converged(file, inside, gate="image.environment_lights", shadows=False, **settings)
+        raw.append(time.perf_counter() - start)
+        lit = realtime(file, environment="lights", **settings)
+        rows.append({"environment": environment, "way": f"{lit.meta['environment_lights']} lights"})
+        rows[-1] |= _error(lit, reference, inside) | {"estimated": lit.meta["estimated_error"]}
+        for order in list(ORDERS)[:: 2 if quick else 1]:
+            for window in ("none", "hanning"):
+                image = realtime(file, environment="sh", order=order, window=window, **settings)
+                rows.append({"environment": environment, "way": f"order {order}", "window": window})
+                rows[-1] |= _error(image, reference, inside)
+                rows[-1] |= {"ringing": image.meta["ringing"], "estimated": image.meta["estimated_error"]}
+    return rows, raw
+
+
+def _transfer(fitted, quick):
+    """Compression of the transfer in a bowl: relative RMSE to spherical harmonics per pixel."""
+    from btfref.render.realtime import realtime
+    from btfref.render.transfer import TransferSettings
+
+    file, settings = _scene(fitted("lpca"), "bowl", "studio")
+    inside, rows, raw = _inside(file, settings), [], []
+    exact = realtime(file, environment="sh", **settings).image[inside]
+    settings_of = [{"clusters": k} for k in CLUSTERS] + [{"components": c} for c in COMPONENTS]
+    settings_of += [{"bits": 8}, {"bits": 8, "components": 4}]
+    for given in settings_of[:: 2 if quick else 1]:
+        start = time.perf_counter()
+        image = realtime(file, environment="transfer", transfer=TransferSettings(**given), **settings)
+        raw.append(time.perf_counter() - start)
+        error = float(np.sqrt(np.mean((image.image[inside] - exact) ** 2)) / exact.mean())
+        facts = ("matrix_clusters", "matrix_components", "bits", "matrix_error", "table_bytes")
+        rows.append({**{k: image.meta[k] for k in facts}, "rmse": error})
+    return rows, raw
+
+
+def _time(fitted, quick):
+    """Milliseconds of the products at the paper's setting, and of frames."""
+    from btfref.render import transfer_light
+    from btfref.render.lighting import lighting_of
+    from btfref.render.realtime import Renderer
+    from btfref.render.scene import read_scene
+    from btfref.render.transfer import TransferSettings
+
+    rows, raw = [], {}
+    file, settings = _scene(fitted("lpca"), "bowl", "studio")
+    size = (200, 200) if quick else FRAME
+    scene = read_scene(file, settings["parameters"], size=size)
+    lighting = lighting_of(scene, "transfer", transfer=TransferSettings())
+    with Renderer(scene, lighting=lighting) as renderer:
+        light = renderer.transfers[0]
+        tasks = {
+            "products, 32 × 8 × 16 × 4": lambda: light.relight(lighting.coefficients),
+            "products while moving, 4 and 1": lambda: light.relight(lighting.coefficients, moving=True),
+            "8-bit codes of them": lambda: transfer_light.encoded(light._full),
+        }
+        for name, task in tasks.items():
+            task()
+            raw[name] = []
+            for _ in range(ROUNDS):
+                start = time.perf_counter()
+                task()
+                raw[name].append(1e3 * (time.perf_counter() - start))
+        light.relight(lighting.coefficients)
+        name = f"frame {size[0]}×{size[1]}, transfer"
+        raw[name] = [renderer.draw() for _ in range(3)]
+    with Renderer(scene, lighting=lighting_of(scene, "sh")) as renderer:
+        renderer.draw()
+        raw[f"frame {size[0]}×{size[1]}, order 5 per pixel"] = [renderer.draw() for _ in range(3)]
+    rows = [{"what": name, "median_ms": statistics.median(times)} for name, times in raw.items()]
+    return rows, raw
+
+
+def table(result):
+    """Rows for people: table, setting, error."""
+    rows = []
+    for entry in result["summary"].get("prefiltered", ()):
+        rows.append((f"prefiltered, {entry['method']}", entry["environment"], _percent(entry)))
+    for entry in result["summary"].get("order", ()):
+        window = "" if entry.get("window", "none") == "none" else f", {entry['window']}"
+        ringing = f", ringing {100 * entry['ringing']:.0f} %" if "ringing" in entry else ""
+        rows.append((f"lpca, {entry['way']}{window}", entry["environment"], _percent(entry) + ringing))
+    for entry in result["summary"].get("transfer", ()):
+        setting = f"{entry['matrix_clusters']} × {entry['matrix_components']}, {entry['bits']} bits"
+        rows.append((f"transfer {setting}", f"{entry['table_bytes']} bytes", f"{100 * entry['rmse']:.3f} %"))
+    for entry in result["summary"].get("time", ()):
+        rows.append((entry["what"], "", f"{entry['median_ms']:.1f} ms"))
+    return ("what", "where", "relative RMSE (99 %), or time"), rows
+
+
+def _percent(entry):
+    return f"{100 * entry['rmse']:.2f} % ({100 * entry['low']:.2f} … {100 * entry['high']:.2f})"
+
+
+def plot(result, path):
+    """Error against the order of spherical harmonics, one line an environment.
+
+    Parameters
+    ----------
+    result : dict
+        Of :func:`run`.
+    path : path-like
+        ``.png``.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    axes = figure.subplots()
+    entries = [e for e in result["summary"].get("order", ()) if e["way"].startswith("order")]
+    for number, environment in enumerate(dict.fromkeys(e["environment"] for e in entries)):
+        for window, style in (("none", "-"), ("hanning", ":")):
+            own = [e for e in entries if (e["environment"], e["window"]) == (environment, window)]
+            label = environment if window == "none" else None
+            orders = [int(e["way"].split()[1]) for e in own]
+            axes.semilogy(
+                orders, [e["rmse"] for e in own], style, marker="o", color=f"C{number}", label=label
+            )
+    axes.set_xlabel("order of spherical harmonics (dotted: Hanning window)")
+    axes.set_ylabel("relative RMSE of the picture")
+    axes.legend()
+    axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=120)
