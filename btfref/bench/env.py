@@ -219,33 +219,7 @@ def _percent(entry):
 
 
 def plot(result, path):
-    """Error against the order of spherical harmonics, one line an environment.
+    """Error against the order of spherical harmonics: see :func:`btfref.report.order_plot.plot_orders`."""
+    from btfref.report.order_plot import plot_orders
 
-    Parameters
-    ----------
-    result : dict
-        Of :func:`run`.
-    path : path-like
-        ``.png``.
-    """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4.5), layout="constrained")
-    axes = figure.subplots()
-    entries = [e for e in result["summary"].get("order", ()) if e["way"].startswith("order")]
-    for number, environment in enumerate(dict.fromkeys(e["environment"] for e in entries)):
-        for window, style in (("none", "-"), ("hanning", ":")):
-            own = [e for e in entries if (e["environment"], e["window"]) == (environment, window)]
-            label = environment if window == "none" else None
-            orders = [int(e["way"].split()[1]) for e in own]
-            axes.semilogy(
-                orders, [e["rmse"] for e in own], style, marker="o", color=f"C{number}", label=label
-            )
-    axes.set_xlabel("order of spherical harmonics (dotted: Hanning window)")
-    axes.set_ylabel("relative RMSE of the picture")
-    axes.legend()
-    axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=120)
+    plot_orders(result["summary"].get("order", ()), path)

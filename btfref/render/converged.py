@@ -10,7 +10,7 @@ from btfref.compare.tolerances import tolerance
 from btfref.render.reference import BATCHES, render
 
 #: Samples a pixel of the first round, and most of all rounds.
-FIRST, MOST = 256, 1 << 15
+FIRST, MOST = 256, 1 << 16
 
 
 def converged(
