@@ -338,7 +338,7 @@ def test_the_command_line_takes_files(tmp_path, llvm, capsys):
 
 
 def test_geometry_truth_of_a_file_that_changed_is_refused(tmp_path, llvm):
-    from btfref.render.geometry import _mesostructure
+    from btfref.render.geometry import _built
     from btfref.sampling import open_store
     from btfref.sampling.synthesis import synthesize_store
 
@@ -346,12 +346,11 @@ def test_geometry_truth_of_a_file_that_changed_is_refused(tmp_path, llvm):
     out = tmp_path / "h.btf.zarr"
     synthesize_store(out, file, texels=2, views="1x3", lights="1x3", spp=2)
     parent = open_store(out).attributes["parent"]
-    again = _mesostructure(None, parent, None)
+    again = _built("h.lpca.exr", parent)
     assert np.array_equal(again.parts[0].vertices, build(file).parts[0].vertices)
     _png16(tmp_path / "h.png", _waves(8, (1, 2)))
-    plane = type("Plane", (), {"filename": "h.lpca.exr"})
     with pytest.raises(InputError, match="has changed"):
-        _mesostructure(plane, parent, None)
+        _built("h.lpca.exr", parent)
 
 
 def test_a_textured_mesh_is_synthesized_alike_by_both_estimators(tmp_path, llvm):
