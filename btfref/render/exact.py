@@ -28,7 +28,7 @@ LANES = 1 << 20
 def render_exact(
     scene, *, parameters=None, spp=16, grid=2, seed=0, size=None, max_depth=None, batches=BATCHES
 ):
-    """Path trace the mesostructure at the hits of a scene with delta lights, without cast shadows.
+    """Path trace the mesostructure at the hits of a scene with delta lights or an environment, without cast shadows.
 
     Parameters
     ----------
@@ -110,9 +110,9 @@ def _pass(scene, material, tiles, grid, rounds, stream, max_depth):
     lane = dr.arange(mi.UInt32, count * width * height * each)
     keys = stream_keys(seed, first)
     pixel, cell = (lane // each) % (width * height), lane % grid**2
-    u, v, _, _ = uniforms(lane, keys, mi.UInt32(0))
+    u, v, *chosen = uniforms(lane, keys, mi.UInt32(0))
     offset = (mi.Float(cell % grid) + u) / grid, (mi.Float(cell // grid) + v) / grid
-    si, uv, w_view, lights = _intersect(scene, material, offset, pixel)
+    si, uv, w_view, lights = _intersect(scene, material, offset, pixel, mi.Point2f(*chosen))
     lights = [(w, dr.select(w.z > 0, power, 0)) for w, power in lights]
     origin = dr.fma(w_view, START, mi.Point3f(uv.x - dr.floor(uv.x), uv.y - dr.floor(uv.y), 0))
     samples = dr.zeros(mi.Color3f, dr.width(lane))
@@ -200,23 +200,23 @@ def _single_material(scene, parameters=None, *, size=None):
     return description, first
 
 
-def _delta_lights(scene):
-    """The emitters of a Mitsuba scene, refused unless all are directional or points."""
+def _distant_or_delta(scene):
+    """The emitters of a Mitsuba scene; those that have an area at a finite distance are refused."""
     import mitsuba as mi
 
-    delta = int(mi.EmitterFlags.DeltaPosition) | int(mi.EmitterFlags.DeltaDirection)
+    known = mi.EmitterFlags.DeltaPosition, mi.EmitterFlags.DeltaDirection, mi.EmitterFlags.Infinite
     for emitter in scene.emitters():
-        if not int(emitter.flags()) & delta:
+        if not int(emitter.flags()) & sum(int(flag) for flag in known):
             raise InputError(
-                "hits know delta lights only",
+                "unsupported light",
                 field="emitter",
                 got=emitter.class_name(),
-                expected="point, directional",
+                expected="point, directional, constant or envmap",
             )
     return scene.emitters()
 
 
-def _intersect(scene, material, offset, pixel=None):
+def _intersect(scene, material, offset, pixel, chosen):
     """Hits of one camera ray a pixel, as Dr.Jit arrays.
 
     Parameters
@@ -225,8 +225,10 @@ def _intersect(scene, material, offset, pixel=None):
     material : BtfMaterial
     offset : (float or mitsuba.Float, float or mitsuba.Float)
         Place in each pixel, from its top left.
-    pixel : mitsuba.UInt32, optional
-        Flat indices of the pixels; by default all, one after the other.
+    pixel : mitsuba.UInt32
+        Flat indices of the pixels.
+    chosen : mitsuba.Point2f
+        Random numbers that choose a direction of an environment.
 
     Returns
     -------
@@ -236,7 +238,7 @@ def _intersect(scene, material, offset, pixel=None):
     w_view : mitsuba.Vector3f
     lights : list of (mitsuba.Vector3f, mitsuba.Color3f)
         Direction in the texture's frame, and irradiance perpendicular to it: 0 where a light does not reach, cast
-        shadows apart.
+        shadows apart. Of an environment one direction, and its radiance over the density of choosing it.
     """
     import drjit as dr
     import mitsuba as mi
@@ -254,8 +256,8 @@ def _intersect(scene, material, offset, pixel=None):
         return turned if (cosine, sine) != (1.0, 0.0) else mi.Vector3f(w.x, w.y, w.z * side)
 
     lights = []
-    for emitter in _delta_lights(scene):
-        sample, power = emitter.sample_direction(si, mi.Point2f(0.5), si.is_valid())
+    for emitter in _distant_or_delta(scene):
+        sample, power = emitter.sample_direction(si, chosen, si.is_valid())
         power = dr.select(si.is_valid() & (sample.pdf > 0), mi.Color3f(power), 0)
         lights.append((local(si.to_local(sample.d)), power))
     return si, uv, local(si.wi), lights

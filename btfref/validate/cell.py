@@ -16,7 +16,8 @@ from btfref.errors import BtfrefError
 from btfref.scenes import scene_file
 from btfref.validate.cache import code_of, key_of
 from btfref.validate.material import fit_key
-from btfref.validate.pictures import fitted, make_views, views_key
+from btfref.validate.matrix import LIGHTS
+from btfref.validate.pictures import fitted, make_views, noisy_pictures, views_key
 
 #: Gates of a picture in real time against the reference under delta lights.
 GATES = (
@@ -27,8 +28,14 @@ GATES = (
     "image.negative",
 )
 
-#: Names of the stages between pictures under delta lights.
-STAGES = ("sampled BTF", "fit", "port", "real time", "8 bits")
+#: Under an environment, by the way in which it lights in real time.
+ENVIRONMENT_GATES = {
+    "lights": ("image.environment_lights", "image.background"),
+    "prefiltered": ("image.environment", "image.environment_tiles", "image.background"),
+}
+
+#: Samples per pixel of a reference under an environment at most.
+MOST = 1 << 13
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +49,14 @@ class CellResult:
     images : dict of str to (H, W, 3) float32 array
         ``truth``, ``reference``, ``realtime``.
     classes : (H, W) uint8 array or None
+    variance : (H, W, 3) float32 array or None
+        Of the reference, where it has noise.
     """
 
     facts: dict
     images: dict
     classes: np.ndarray | None = None
+    variance: np.ndarray | None = None
 
     @property
     def outcome(self):
@@ -66,7 +76,13 @@ class CellResult:
         keys = self.facts.get("image_gates")
         if not self.images or keys is None:
             return None
-        return compare(self.images["realtime"], self.images["reference"], classes=self.classes, gate=keys)
+        return compare(
+            self.images["realtime"],
+            self.images["reference"],
+            classes=self.classes,
+            gate=keys,
+            variance=self.variance,
+        )
 
 
 def gate_from(facts):
@@ -109,7 +125,8 @@ def make_cell(cache, spec, settings):
 
 def failed_cell(spec, why):
     """A cell whose reference, or whose picture, could not be made: a failure of every gate."""
-    gates = [g.to_dict() for key in GATES for g in missing_reference(key, why)]
+    keys = GATES if "environment" not in LIGHTS.get(spec.lights, {}) else ENVIRONMENT_GATES["lights"]
+    gates = [g.to_dict() for key in keys for g in missing_reference(key, why)]
     facts = {"name": spec.name, **vars(spec), "gates": gates, "notes": why, "waterfall": None}
     return CellResult(json_safe(facts), {})
 
@@ -118,46 +135,46 @@ def read_cell(path):
     """A cell from its file."""
     with np.load(path) as stored:
         images = {name[6:]: stored[name] for name in stored.files if name.startswith("image_")}
-        return CellResult(json.loads(str(stored["facts"])), images, stored["classes"])
+        variance = stored["variance"] if "variance" in stored.files else None
+        return CellResult(json.loads(str(stored["facts"])), images, stored["classes"], variance)
 
 
 def _save(path, result):
     images = {f"image_{name}": image for name, image in result.images.items()}
+    if result.variance is not None:
+        images["variance"] = result.variance
     np.savez_compressed(path, facts=json.dumps(result.facts), classes=result.classes, **images)
 
 
 def _cell(cache, spec, settings):
-    from btfref.render.approximate import approximate
-    from btfref.render.realtime import realtime
-    from btfref.render.reference import render
     from btfref.representations.container import read_info
 
     start = time.perf_counter()
     file, path = fitted(cache, spec, settings), scene_file(spec.scene)
     views = make_views(cache, spec.mesostructure, spec.scene, spec.lights, settings)
-    size = (settings.size, settings.size)
-    shared = {"parameters": {"btf": str(file), "lights": spec.lights}, "size": size}
-    definition = approximate(path, grid=settings.grid, **shared)
-    reference = render(path, noise_free=settings.grid, shadows=False, **shared)
-    image = realtime(path, grid=settings.grid, **shared)
-
+    shared = {
+        "parameters": {"btf": str(file), **LIGHTS[spec.lights]},
+        "size": (settings.size, settings.size),
+    }
+    under = _under_environment if "environment" in LIGHTS[spec.lights] else _under_deltas
+    chain, reference, image, gates, facts = under(path, file, spec, views, settings, shared)
     display = fit_display(views.truth.mean(0), views.classes > 0)
     counts = np.isin(views.classes, (1, 3))
     chain = [
         Picture("geometry", views.truth),
-        Picture(STAGES[0], views.sampled[None]),
-        Picture(STAGES[1], definition.image[None]),
-        Picture(STAGES[2], reference.image[None]),
-        Picture(STAGES[3], image.image[None]),
-        Picture(STAGES[4], eight_bits(image.image, display)[None]),
+        Picture("sampled BTF", views.sampled),
+        *chain,
+        Picture("8 bits", eight_bits(image.image, display)[None]),
     ]
     found = waterfall(chain, counts, display)
-    comparison = compare(image.image, reference.image, classes=views.classes, gate=GATES)
+    comparison = compare(
+        image.image, reference.image, classes=views.classes, gate=gates, variance=reference.variance
+    )
     facts = {
         "name": spec.name,
         **vars(spec),
         "gates": [gate.to_dict() for gate in (*comparison.gates, *found.gates)],
-        "image_gates": list(GATES),
+        "image_gates": list(gates),
         "metrics": {name: comparison.metrics.get(name, {}) for name in ("interior", "all")},
         "waterfall": {
             **found.to_dict(),
@@ -165,18 +182,57 @@ def _cell(cache, spec, settings):
             "display": display.to_dict(),
         },
         "bytes": read_info(file)["payload_bytes"],
-        "seconds": {
-            "definition": definition.meta["seconds"],
-            "reference": reference.meta["seconds"],
-            "cell": time.perf_counter() - start,
-        },
+        "seconds": {"reference": reference.meta["seconds"], "cell": time.perf_counter() - start},
         "frame_ms": image.meta["frame_ms"],
         "negative_fraction": image.meta["negative_fraction"],
         "gl_renderer": image.meta["gl_renderer"],
         "notes": f"{found.explanation} Both renderers read one file and one scene; neither casts shadows.",
+        **facts,
     }
     images = {"truth": views.truth.mean(0), "reference": reference.image, "realtime": image.image}
-    return CellResult(json_safe(facts), images, views.classes)
+    return CellResult(json_safe(facts), images, views.classes, reference.variance)
+
+
+def _under_deltas(path, file, spec, views, settings, shared):
+    """Chain, reference, picture in real time, gates and facts where nothing is random."""
+    from btfref.render.approximate import approximate
+    from btfref.render.realtime import realtime
+    from btfref.render.reference import render
+
+    definition = approximate(path, grid=settings.grid, **shared)
+    reference = render(path, noise_free=settings.grid, shadows=False, **shared)
+    image = realtime(path, grid=settings.grid, **shared)
+    chain = [("fit", definition.image), ("port", reference.image), ("real time", image.image)]
+    return [Picture(name, picture[None]) for name, picture in chain], reference, image, GATES, {}
+
+
+def _under_environment(path, file, spec, views, settings, shared):
+    """The same under an environment: the reference is traced until its noise decides nothing.
+
+    Real time approximates here, so that the stage in float64 comes before its port.
+    """
+    from btfref.render.approximate import approximate
+    from btfref.render.converged import converged
+    from btfref.render.realtime import realtime
+
+    image = realtime(path, grid=settings.grid, **shared)
+    definition = approximate(path, grid=settings.grid, **shared)
+    way = image.meta["environment_path"]
+    gates = ENVIRONMENT_GATES[way]
+    mask = views.classes == 1
+    reference = converged(path, mask, gate=gates[0], shadows=False, grid=settings.grid, most=MOST, **shared)
+    pictures = noisy_pictures(path, file, spec.lights, settings, seed=settings.seed + 5)
+    chain = [
+        Picture("fit", pictures),
+        Picture("real time", definition.image[None]),
+        Picture("port", image.image[None]),
+    ]
+    facts = {
+        "environment_path": way,
+        "reference_spp": reference.meta["spp"],
+        "reference_noise": reference.meta["noise"],
+    }
+    return chain, reference, image, gates, facts
 
 
 def eight_bits(image, display):
@@ -201,11 +257,14 @@ def sampling_noise(views, mask):
 
     Returns
     -------
-    dict
-        ``mse``: mean square without that noise, directions and texels alone; ``noise``: that of the noise.
+    dict or None
+        ``mse``: mean square without that noise, directions and texels alone; ``noise``: that of the noise. None without
+        a twin.
     """
-    a, b = (views.sampled - views.truth[0])[mask], (views.twin - views.truth[1])[mask]
-    noise = 0.5 * np.mean((views.sampled - views.twin)[mask].astype(float) ** 2)
+    if not views.twin.size:
+        return None
+    a, b = (views.sampled[0] - views.truth[0])[mask], (views.twin - views.truth[1])[mask]
+    noise = 0.5 * np.mean((views.sampled[0] - views.twin)[mask].astype(float) ** 2)
     return {"mse": float(np.mean(a * b, dtype=float)), "noise": float(noise)}
 
 

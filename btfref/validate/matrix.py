@@ -11,12 +11,17 @@ from btfref.scenes import scene_file
 #: Scenes that show a BTF on a shape of their own: flat, curved, folded and seen from both sides.
 SCENES = ("plane", "sphere", "cloth")
 
-#: Lights of the scenes → how they light. Deltas can be compared without noise.
-LIGHTS = {"directional1": "delta", "directional3": "delta", "points2": "delta"}
+#: Lights → parameters of the shipped scenes. Under an environment (those with that parameter) nothing is free of noise.
+LIGHTS = {
+    "directional1": {"lights": "directional1"},
+    "directional3": {"lights": "directional3"},
+    "points2": {"lights": "points2"},
+    "sky": {"lights": "envmap", "environment": "sky"},
+}
 
 MESOSTRUCTURES = ("checker", "rings", "tissue")
 
-#: What the quick run shows of each method: every scene once, every kind of light once.
+#: What the quick run shows of each method: every scene once, every kind of light.
 QUICK_VIEWS = (("plane", "directional1"), ("sphere", "directional3"), ("cloth", "points2"))
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from btfref.scenes import scene_file
 from btfref.validate.cache import code_of, key_of
 from btfref.validate.material import fit_key, load_material, make_fit, make_material, material_key
+from btfref.validate.matrix import LIGHTS
 
 #: Fit whose file stands for the material where only its origin counts: the smallest one.
 CARRIER = {"method": "svd", "parameters": {"components": 1}}
@@ -25,8 +26,10 @@ class Views:
     ----------
     truth : ndarray of float32, shape (batches, H, W, 3)
         The mesostructure under every hit.
-    sampled, twin : ndarray of float32, shape (H, W, 3)
-        The sampled BTF by interpolation in float64, and one of other random numbers.
+    sampled : ndarray of float32, shape (n, H, W, 3)
+        The sampled BTF, interpolated: in float64 without noise; under an environment, independent pictures by paths.
+    twin : ndarray of float32, shape (H, W, 3), or (0,)
+        A sampled BTF of other random numbers, under delta lights.
     classes : ndarray of uint8, shape (H, W)
     """
 
@@ -38,12 +41,12 @@ class Views:
 
 def views_key(mesostructure, scene, lights, settings):
     """Key of a `Views`."""
-    named = ("size", "grid", "truth_spp")
+    named = ("size", "grid", "truth_spp", "environment_spp")
     return key_of(
         {
             "views": material_key(mesostructure, settings),
             "scene": scene_file(scene).read_text("utf-8"),
-            "lights": lights,
+            "lights": LIGHTS[lights],
             **{name: getattr(settings, name) for name in named},
             "carrier": CARRIER,
             "code": code_of("picture", CARRIER["method"]),
@@ -75,14 +78,29 @@ def _views(cache, mesostructure, scene, lights, settings):
     stores = make_material(cache, mesostructure, settings)
     carrier = make_carrier(cache, mesostructure, settings)
     path, size = scene_file(scene), (settings.size, settings.size)
-    parameters = {"btf": str(carrier), "lights": lights}
+    parameters = {"btf": str(carrier), **LIGHTS[lights]}
     shared = {"parameters": parameters, "grid": settings.grid, "size": size}
     truth = render_exact(path, spp=settings.truth_spp, seed=TRUTH_SEED, **shared)
+    classes = pixel_classes(path, **shared)
+    if "environment" in LIGHTS[lights]:
+        table = make_fit(cache, mesostructure, "raw", settings)
+        pictures = noisy_pictures(path, table, lights, settings, seed=TRUTH_SEED + 1)
+        return Views(truth.meta["batches"], pictures, np.zeros(0, np.float32), classes)
     seen = []
     for store in stores:
         table = method("raw").fit(load_material(store))
         seen.append(approximate(path, load_file=lambda _, table=table: table, **shared).image)
-    return Views(truth.meta["batches"], *seen, pixel_classes(path, **shared))
+    return Views(truth.meta["batches"], seen[0][None], seen[1], classes)
+
+
+def noisy_pictures(path, file, lights, settings, *, seed):
+    """Independent pictures of a representation under an environment by paths, float32 (4, H, W, 3)."""
+    from btfref.render.reference import render
+
+    parameters, size = {"btf": str(file), **LIGHTS[lights]}, (settings.size, settings.size)
+    seeds = np.random.SeedSequence(seed).generate_state(4)
+    shared = {"spp": settings.environment_spp, "grid": settings.grid, "shadows": False, "size": size}
+    return np.stack([render(path, parameters=parameters, seed=int(s), **shared).image for s in seeds])
 
 
 def make_carrier(cache, mesostructure, settings):
