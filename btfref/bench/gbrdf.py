@@ -15,11 +15,14 @@ from btfref.bench.timing import machine
 #: Pairs of directions whose pictures are compared by colour difference.
 N_PICTURES = 64
 
+#: Pixels per side of a texel in the report.
+_ENLARGED = 4
+
 #: Texels per side; times between them show whether cost is linear.
 SIZES = (32, 64)
 
 
-def run(*, quick=False, progress=None, btf=None, only=None):
+def run(*, quick=False, progress=None, btf=None, only=None, report=None):
     """Times and errors.
 
     Parameters
@@ -31,13 +34,16 @@ def run(*, quick=False, progress=None, btf=None, only=None):
         Instead of the checkers; heights are compared with the truth for checkers alone.
     only : iterable of str, optional
         Ignored: there is one method.
+    report : path-like, optional
+        HTML page with the maps, where the truth is known.
 
     Returns
     -------
     dict
         ``cases``: per BTF the seconds, microseconds a texel and pair, materials, bytes, height and normal errors of
         "ours", "correlation" and "Helmholtz", ``delta_e00`` of "gbrdf", "lpca" and "oracle" (the g-BRDF of the
-        geometry itself).
+        geometry itself), ``areas``: texels of each material, and ``colours``: mean c_d over the texels of each true
+        material, of "ours" and "truth".
     """
     from btfref.sampling.synthesis import synthesize
 
@@ -48,11 +54,17 @@ def run(*, quick=False, progress=None, btf=None, only=None):
         cases = [
             synthesize("checker", texels=n, spp=16, estimator="surface", progress=progress) for n in sizes
         ]
-    return {"suite": "gbrdf", "cases": [case(b, progress) for b in cases], "machine": machine()}
+    cells = []
+    result = {"suite": "gbrdf", "cases": [case(b, progress, cells) for b in cases], "machine": machine()}
+    if report is not None:
+        from btfref.report import write_report
+
+        write_report(report, title="Decomposition into g-BRDFs", cells=cells, facts=result["machine"])
+    return result
 
 
-def case(btf, progress=None):
-    """Figures of one BTF; see :func:`run`."""
+def case(btf, progress=None, cells=None):
+    """Figures of one BTF; see :func:`run`. A list ``cells`` takes the parts of a report."""
     from btfref.decomposition import pipeline
     from btfref.registry import method
     from btfref.representations.container import payload_bytes
@@ -83,8 +95,28 @@ def case(btf, progress=None):
         "delta_e00": {key: picture_error(rep, btf) for key, rep in others.items()},
     }
     if known:
-        result["heights"] = height_errors(btf, stages, others["oracle"])
+        truth = others["oracle"]
+        fields = height_fields(btf, stages)
+        result["heights"] = height_errors(fields, truth.field)
+        result |= material_figures(made, truth)
+        if cells is not None:
+            cells += map_cells(f"{name} {btf.texels[0]}²", fields, made, truth)
     return result
+
+
+def material_figures(made, truth):
+    """``areas`` and ``colours`` of materials, found and true; see :func:`run`."""
+    part = truth.maps["material"][..., 0]
+    both = {"ours": made, "truth": truth}
+    return {
+        "areas": {
+            key: np.bincount(rep.maps["material"].ravel().astype(int)).tolist() for key, rep in both.items()
+        },
+        "colours": {
+            key: [rep.maps["diffuse"][part == k].astype(float).mean(0).tolist() for k in np.unique(part)]
+            for key, rep in both.items()
+        },
+    }
 
 
 def picture_error(representation, btf):
@@ -105,8 +137,8 @@ def picture_error(representation, btf):
     return float(np.sqrt((error**2).mean()))
 
 
-def height_errors(btf, stages, truth):
-    """RMS error of heights in tiles and mean angle between normals in degrees, of ours and the paper's baselines."""
+def height_fields(btf, stages):
+    """Heights in tiles and slopes by name: ours and the paper's two baselines."""
     from btfref.decomposition.heights import correlation_heights, helmholtz_stereopsis, similarity
     from btfref.decomposition.pairs import ReciprocalPairs
     from btfref.numerics.heightfield import HeightField
@@ -119,23 +151,67 @@ def height_errors(btf, stages, truth):
         "correlation": (correlation, None),
         "Helmholtz": (helmholtz, slopes),
     }
-    result = {}
-    for key, (heights, own) in found.items():
-        own = HeightField(heights.astype(np.float32)).slopes if own is None else own
-        result[key] = {
-            "rms": float(np.sqrt(np.mean((heights - truth.field.heights) ** 2))),
-            "angle": mean_angle(own, truth.field.slopes),
+    return {
+        key: (heights, HeightField(heights.astype(np.float32)).slopes if own is None else own)
+        for key, (heights, own) in found.items()
+    }
+
+
+def height_errors(fields, truth):
+    """RMS error of heights in tiles and mean angle between normals in degrees, of :func:`height_fields`."""
+    return {
+        key: {
+            "rms": float(np.sqrt(np.mean((heights - truth.heights) ** 2))),
+            "angle": mean_angle(slopes, truth.slopes),
         }
-    return result
+        for key, (heights, slopes) in fields.items()
+    }
+
+
+def map_cells(name, fields, made, truth):
+    """Parts of a report: heights, normals, materials and colours beside the truth."""
+    from btfref.compare import compare
+    from btfref.report import Cell
+    from btfref.representations.gbrdf_maps import PALETTE
+
+    low, high = truth.field.bottom, truth.field.top
+    depth = max(high - low, 1e-6)
+    every = fields | {"truth": (truth.field.heights, truth.field.slopes)}
+    heights = {
+        key: np.repeat(np.clip((h - low) / depth, 0, 1)[..., None], 3, -1) for key, (h, _) in every.items()
+    }
+    normals = {key: 0.5 + 0.5 * unit_normals(slopes) for key, (_, slopes) in every.items()}
+    reps = {"ours": made, "truth": truth}
+    colours = {key: rep.maps["diffuse"] for key, rep in reps.items()}
+    palette = np.array(PALETTE) / 255
+    materials = {key: palette[rep.maps["material"][..., 0] % len(palette)] for key, rep in reps.items()}
+    cells = []
+    for what, images in (
+        ("heights", heights),
+        ("normals", normals),
+        ("diffuse colour", colours),
+        ("materials", materials),
+    ):
+        shown = {"reference": images.pop("truth"), **images}
+        large = {
+            k: np.kron(v, np.ones((_ENLARGED, _ENLARGED, 1))).astype(np.float32) for k, v in shown.items()
+        }
+        comparison = compare(large["ours"], large["reference"], flip=False)
+        cells.append(Cell(f"{name} · {what}", large, comparison, "The reference is the modelled geometry."))
+    return cells
 
 
 def mean_angle(a, b):
     """Mean angle in degrees between the normals of two maps of slopes, shape (rows, columns, 2)."""
-    normals = []
-    for slopes in (a, b):
-        normal = np.concatenate([-np.asarray(slopes, float), np.ones((*slopes.shape[:2], 1))], -1)
-        normals.append(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
-    return float(np.degrees(np.arccos(np.clip((normals[0] * normals[1]).sum(-1), -1, 1))).mean())
+    product = (unit_normals(a) * unit_normals(b)).sum(-1)
+    return float(np.degrees(np.arccos(np.clip(product, -1, 1))).mean())
+
+
+def unit_normals(slopes):
+    """Normals of slopes, shape (..., 2) -> (..., 3)."""
+    slopes = np.asarray(slopes, float)
+    normal = np.concatenate([-slopes, np.ones((*slopes.shape[:-1], 1))], -1)
+    return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
 
 
 def table(result):
