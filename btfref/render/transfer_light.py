@@ -161,7 +161,8 @@ class TransferLight:
 
     def __init__(self, material, transfer, light, *, two_sided=False, bits=32):
         self.material, self.transfer, self.two_sided, self.bits = material, transfer, two_sided, bits
-        self._full = None
+        # Kept for the next light: new memory costs as much as the products.
+        self._full = self._coarse = None
         self.relight(light)
 
     def relight(self, light, *, moving=False):
@@ -177,7 +178,8 @@ class TransferLight:
         components = MOVING[0] if moving else None
         rows = transferred(self.transfer, light, two_sided=self.two_sided, components=components)
         if moving:
-            self.table = products(self.material, rows, moving=True)
+            self._coarse = products(self.material, rows, out=self._coarse, moving=True)
+            self.table = self._coarse
         else:
             self._full = products(self.material, rows, out=self._full)
             self.table = self._full
