@@ -40,7 +40,8 @@ def _compare(llvm, name, estimator, n_pairs, rounds):
     plain = PlainRenders(llvm, tile, texels=TEXELS, reach=3, max_depth=8)
     index = np.random.default_rng(30).choice(len(CHOSEN) ** 2, n_pairs, replace=False)
     means, p, theirs, noise = [], [], [], []
-    for v, k in zip(*np.divmod(index, len(CHOSEN)), strict=True):
+    # Python's own numbers: Mitsuba takes no NumPy ones for seeds.
+    for v, k in (divmod(number, len(CHOSEN)) for number in index.tolist()):
         image, variance = plain.pair(
             vectors[v], vectors[k], spp=ROUND_SPP, rounds=rounds, seed=100 * (6 * v + k)
         )
