@@ -354,9 +354,12 @@ def direct(scene, ray, shadows):
         emitter = dr.gather(mi.EmitterPtr, emitters, i, si.is_valid())
         sample, power = emitter.sample_direction(si, mi.Point2f(0.5), si.is_valid())
         active = si.is_valid() & (sample.pdf > 0)
+        local = si.to_local(sample.d)
+        # What only reflects is black under a light behind it: no shadow ray and no lookup.
+        active &= (local.z * si.wi.z > 0) | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
         if shadows:
             active &= ~scene.ray_test(si.spawn_ray_to(sample.p), active)
-        value = bsdf.eval(context, si, si.to_local(sample.d), active)
+        value = bsdf.eval(context, si, local, active)
         return i + 1, sum_ + dr.select(active, power * value, 0)
 
     count = len(scene.emitters())
