@@ -216,8 +216,6 @@ def test_realtime_refuses_what_it_cannot_show(llvm):
     del bare["integrator"]
     with pytest.raises(InputError, match="integrator"):
         render(bare, spp=1)
-    with pytest.raises(InputError, match="shadows"):
-        render(room(llvm, shapes=sphere, lights=LIGHTS), shadows=False)
     with pytest.raises(InputError, match="variant"):
         render(room(llvm, shapes=sphere, lights=LIGHTS), variant="scalar_float")
     with pytest.raises(InputError, match="JIT"):
