@@ -26,6 +26,10 @@ from btfref.render.transfer import TransferSettings, clustered, corner_matrices,
 #: Lookups whose mean is the albedo of a material.
 ALBEDO_SAMPLES = 512
 
+#: Lights of a picture that is drawn at once: Mesa's llvmpipe ends a shader's loops, all together, after 65 535 steps
+#: (LP_MAX_TGSI_LOOP_ITERATIONS) without a word, and drivers of GPUs end draws that take seconds.
+PASS = 32
+
 #: Values of B evaluated at a time in float64.
 BLOCK = 1 << 18
 
@@ -50,8 +54,10 @@ class Prepared:
         JSON-able: for the picture's ``meta``.
     constants : dict
         Of the GLSL file.
+    passes : tuple of dict
+        Uniforms of pictures that add up; one, without any, where a single picture does.
     bins : ndarray of int, shape (n + 1,), or None
-        Where the triangles of each of n pictures that add up begin, in the table ``bin_triangles``.
+        Where the triangles of each pass begin in the table ``bin_triangles``; None: all are drawn.
     transfer : btfref.render.transfer_light.TransferLight or None
         What can be lit anew.
     """
@@ -62,6 +68,7 @@ class Prepared:
     radiance: object
     facts: dict = field(default_factory=dict)
     constants: dict = field(default_factory=dict)
+    passes: tuple = ({},)
     bins: np.ndarray | None = None
     transfer: object = None
 
@@ -213,7 +220,11 @@ class Lighting:
 
         facts = {"environment_lights": len(found), "estimated_error": found.error}
         tables = {"environment_lights": found.table()}
-        return Prepared("lights", "environment/lights.glsl", tables, radiance, facts)
+        passes = tuple(
+            {"environment_first": first, "environment_end": min(first + PASS, len(found))}
+            for first in range(0, len(found), PASS)
+        )
+        return Prepared("lights", "environment/lights.glsl", tables, radiance, facts, passes=passes)
 
     def _by_sh(self, representation, file):
         order, light = self._order, self.coefficients
@@ -282,7 +293,8 @@ class Lighting:
             "TRANSFER_MATERIALS": len(material.present),
         }
         shader = representation.transfer_shader
-        return Prepared("transfer", shader, tables, radiance, facts, constants, starts, light)
+        passes = tuple({"bin": k, "bin_first": int(first)} for k, first in enumerate(starts[:-1]))
+        return Prepared("transfer", shader, tables, radiance, facts, constants, passes, starts, light)
 
 
 def lighting_of(scene, path="auto", **options):

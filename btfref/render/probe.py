@@ -67,7 +67,10 @@ def probe_environment(rep, light, uv, w_view, to_world, *, filter_type=None):
     points = np.concatenate([np.asarray(uv, np.float32), np.asarray(w_view, np.float32), axes], 1)
     names = {"uv": 2, "w_view": 3, "axis_x": 3, "axis_y": 3, "axis_z": 3}
     tables = gl.ShaderRepresentation.upload(gl.context(), rep, filter_type=filter_type, light=light)
-    return _transformed(tables, "hosts/probe_environment.vert", names, points)
+    host = "hosts/probe_environment.vert"
+    results = [_transformed(tables, host, names, points, {**values}) for values in light.passes]
+    tables.release()
+    return sum(results[1:], results[0])
 
 
 class Probe:
@@ -132,10 +135,9 @@ def probe_points(rep, points, *, filter_type=None):
     return Probe(tables, "hosts/probe.vert", names, points)
 
 
-def _transformed(tables, host, names, points):
-    """``value`` of a vertex host for rows of attributes; the tables are released."""
+def _transformed(tables, host, names, points, uniforms=None):
+    """``value`` of a vertex host for rows of attributes."""
     if not len(points):
-        tables.release()
         return np.zeros((0, 3), np.float32)
     with Probe(tables, host, names, points) as made:
         made.run()

@@ -9,7 +9,6 @@ projection; frames are added in float64.
 from __future__ import annotations
 
 import time
-from itertools import pairwise
 
 import numpy as np
 
@@ -266,7 +265,7 @@ class Renderer:
         start = time.perf_counter()
         query = ctx.query(time=True)
         with query:
-            if any(light is not None and light.bins is not None for *_, light in self._shown.values()):
+            if any(light is not None and len(light.passes) > 1 for *_, light in self._shown.values()):
                 self._fill_depth(common)
             for mesh, key, table in self._meshes:
                 shown, program, vertices, light = self._shown[key]
@@ -276,14 +275,15 @@ class Renderer:
                 own["uv_rotation"] = mesh.material.rotation
                 own |= lod_uniforms(mesh.material, shown.texels, share * camera.pixel_angle)
                 gl.set_uniforms(program, {**common, **own, "two_sided": mesh.material.twosided})
-                if light is None or light.bins is None:
-                    vertices.render(ctx.TRIANGLES, vertices=3 * len(mesh.faces))
-                    continue
-                # Each cluster of matrices is a picture; they add up.
-                gl.set_uniforms(program, {"transfer_components": light.transfer.table.shape[3]})
-                for number, (first, end) in enumerate(pairwise(light.bins.tolist())):
-                    gl.set_uniforms(program, {"bin": number, "bin_first": first})
-                    vertices.render(ctx.TRIANGLES, vertices=3 * (end - first))
+                passes, counts = ({},), [len(mesh.faces)]
+                if light is not None:
+                    passes, counts = light.passes, counts * len(light.passes)
+                    if light.bins is not None:
+                        counts = np.diff(light.bins).tolist()
+                        gl.set_uniforms(program, {"transfer_components": light.transfer.table.shape[3]})
+                for number, (values, count) in enumerate(zip(passes, counts, strict=True)):
+                    gl.set_uniforms(program, {**values, "pass": number})
+                    vertices.render(ctx.TRIANGLES, vertices=3 * count)
         ctx.depth_func = "<"
         ctx.disable(ctx.BLEND)
         ctx.finish()

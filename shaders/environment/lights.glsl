@@ -4,11 +4,13 @@
 #include "lib/table.glsl"
 
 uniform sampler2DArray environment_lights;
+uniform int environment_first;  // light of this pass, and the one after its last
+uniform int environment_end;
 
 // to_world takes local directions to world space.
 vec3 btf_environment(vec2 uv, vec3 w_view, mat3 to_world, float lod) {
     vec3 sum = vec3(0.0);
-    for (int i = 0; i < ENVIRONMENT_LIGHTS_DIM0; ++i) {
+    for (int i = environment_first; i < environment_end; ++i) {
         // A row vector times the matrix: the transpose takes the world's directions to local ones.
         vec3 w_light = table_fetch(environment_lights, 2 * i).xyz * to_world;
         if (w_light.z > 0.0) {

@@ -4,5 +4,5 @@
 out vec4 radiance;
 
 void main() {
-    radiance = vec4(0.0, 0.0, 0.0, 1.0);
+    radiance = vec4(0.0);
 }

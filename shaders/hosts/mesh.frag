@@ -20,6 +20,7 @@ uniform vec3 uv_row1;
 uniform vec2 uv_rotation;   // cosine and sine of the turn that the texture transform gives to the local frame
 uniform float scale;
 uniform bool two_sided;
+uniform int pass;           // number of this picture among those that add up
 
 flat in int triangle;
 
@@ -42,7 +43,8 @@ void main() {
 #endif
     vec3 sum = vec3(0.0);
 #if N_LIGHTS > 0
-    for (int i = 0; i < N_LIGHTS; ++i) {
+    // Passes add up: the first one has them.
+    for (int i = 0; i < (pass == 0 ? N_LIGHTS : 0); ++i) {
         vec3 towards;
         vec3 irradiance = light_incident(i, point.position, towards);
         vec3 w_light = to_local * towards;

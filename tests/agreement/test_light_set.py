@@ -85,6 +85,20 @@ def test_pictures_equal_float64(need, fits, tmp_path, key):
     assert image.image[classes == 1].mean() > 0.01
 
 
+def test_thousands_of_lights_are_all_drawn(need, fits):
+    """A software rasterizer ends long loops without a word: lights are drawn in passes, and none is lost."""
+    from btfref.render.realtime import realtime
+
+    need("gl"), need("llvm")
+    parameters = {"btf": str(fits.path("lpca")), "lights": "constant"}
+    settings = {"parameters": parameters, "grid": 1, "size": (8, 8)}
+    image = realtime(scene_file("sphere"), environment="lights", lights=4096, **settings).image
+    exact = approximate(scene_file("sphere"), path="sh", order=1, **settings).image
+    inside = pixel_classes(scene_file("sphere"), **settings) == 1
+    difference = np.abs(image - exact)[inside].max()
+    assert difference <= tolerance("environment.furnace.max") * exact[inside].max()
+
+
 @pytest.mark.parametrize("key", list(methods()))
 def test_a_constant_environment_is_the_albedo(fits, rng, key):
     """With as many lights as 1e-3 asks for: the integral of B over the hemisphere, by any frame."""
