@@ -344,9 +344,10 @@ def test_info_of_images(tmp_path, capsys):
 
 
 def readme_commands():
-    """The command lines that the README shows."""
-    text = (Path(__file__).parents[2] / "README.md").read_text()
-    return re.findall(r"^btfref .*$", text, re.MULTILINE)
+    """The command lines that the README and the pages of the documentation show."""
+    root = Path(__file__).parents[2]
+    texts = [path.read_text() for path in (root / "README.md", *sorted((root / "btfref/docs").glob("*.md")))]
+    return re.findall(r"^btfref .*$", "\n".join(texts), re.MULTILINE)
 
 
 def test_the_readme_shows_commands():
@@ -355,4 +356,4 @@ def test_the_readme_shows_commands():
 
 @pytest.mark.parametrize("line", readme_commands())
 def test_readme_commands_are_understood(line):
-    assert callable(build_parser().parse_args(shlex.split(line)[1:]).run)
+    assert callable(build_parser().parse_args(shlex.split(line, comments=True)[1:]).run)
