@@ -13,7 +13,10 @@ def plot_growth(rows, path):
     path : path-like
         Image to write.
     """
+    import numpy as np
     from matplotlib.figure import Figure
+
+    from btfref.report.pareto import name_ticks
 
     names = {"texels": "texels along a side", "n_directions": "views = lights", "max_depth": "depth"}
     figure = Figure(figsize=(9, 3), layout="constrained")
@@ -24,6 +27,7 @@ def plot_growth(rows, path):
         axis.loglog(x, [row["peak_bytes"] / 2**30 for row in some], "s--", label="peak memory (GiB)")
         axis.set_xticks(x, [str(value) for value in x])
         axis.minorticks_off()
+        name_ticks(axis.yaxis, np.array([[row["seconds"], row["peak_bytes"] / 2**30] for row in some]))
         axis.set_xlabel(label)
         axis.grid(alpha=0.3, which="both")
     figure.axes[0].legend()

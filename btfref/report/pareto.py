@@ -198,15 +198,15 @@ def _draw(axis, panel, groups):
                 axis.plot([p.x, p.x], [p.low, p.high], "-", color=colour, alpha=opacity, lw=1.2, zorder=2)
         axis.plot([], [], marker, color=colour, ms=6, mec="none", label=group or "all")
     axis.margins(0.12)
-    _name_ticks(axis.xaxis, x)
-    _name_ticks(axis.yaxis, y)
+    name_ticks(axis.xaxis, x)
+    name_ticks(axis.yaxis, y)
     axis.set(title=panel.title, xlabel=panel.x_label, ylabel=panel.y_label)
     axis.grid(alpha=0.25, which="both", lw=0.5)
     axis.set_axisbelow(True)
     return [(p, bool(b)) for p, b in zip(panel.points, best, strict=True)]
 
 
-def _name_ticks(axis, values):
+def name_ticks(axis, values):
     """Plain numbers at 1, 2 and 5 where costs span less than two decades; powers of ten alone otherwise."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
