@@ -49,7 +49,10 @@ def cell(key, scene, environment):
     """A cell of the matrix, long unless quick."""
     marks = [] if (key, scene, environment) in QUICK else [pytest.mark.long]
     if (key, scene, environment) in MISSES:
-        marks.append(pytest.mark.xfail(reason=MISSES[key, scene, environment], strict=True))
+        # A failed gate is what is known; a crash, or a reference that is too noisy to tell, is not.
+        marks.append(
+            pytest.mark.xfail(reason=MISSES[key, scene, environment], raises=AssertionError, strict=True)
+        )
     return pytest.param(key, scene, environment, marks=marks, id=f"{key}-{scene}-{environment}")
 
 
@@ -64,7 +67,9 @@ def compared(path, scene, environment, gates, *, size=(24, 24), way="auto", **op
     image = realtime(file, environment=way, **options, **settings)
     classes = pixel_classes(file, **settings)
     reference = converged(file, classes == 1, gate=gates[0], shadows=False, **settings)
-    assert reference.meta["noise"] <= reference.meta["noise_limit"]
+    if reference.meta["noise"] > reference.meta["noise_limit"]:
+        # Not an AssertionError: an undecided cell is no known miss.
+        pytest.fail("the reference is too noisy to tell")
     return image, compare(image, reference, classes=classes, gate=gates, flip=False)
 
 
