@@ -18,8 +18,9 @@ from btfref.numerics.frames import nearest_rotation
 from btfref.registry import method
 from mitsuba_plugins.footprint import LevelOfDetail
 from mitsuba_plugins.guide import LightGuide
-from mitsuba_plugins.lookup import direction_table, tensor, valid_directions
+from mitsuba_plugins.lookup import direction_table, valid_directions
 from mitsuba_plugins.proposals import Guided, Mixture
+from mitsuba_plugins.tables import tensor
 
 
 class Maps:

@@ -6,8 +6,9 @@ import drjit as dr
 import mitsuba as mi
 
 from btfref.representations.factored import FACTORS, index_slots, raised
-from mitsuba_plugins.lookup import read_packets, texel_stencil, wide
+from mitsuba_plugins.lookup import texel_stencil
 from mitsuba_plugins.parabolic import ParabolicMaps, bilinear_stencil, half_difference, unpacked
+from mitsuba_plugins.tables import read_packets, wide
 
 
 class Evaluator:

@@ -8,9 +8,9 @@ import mitsuba as mi
 from btfref.conventions import LUMINANCE
 from btfref.numerics.frames import ROTATION_FLOOR
 from mitsuba_plugins.heightfield import HeightField
-from mitsuba_plugins.lookup import wide
 from mitsuba_plugins.microfacets import HalfVectors, Microfacets
 from mitsuba_plugins.parabolic import ParabolicMaps, bilinear_stencil
+from mitsuba_plugins.tables import wide
 
 
 class Evaluator:

@@ -10,7 +10,8 @@ from btfref.numerics.footprint import ANISOTROPY
 from btfref.numerics.ycbcr import TO_RGB
 from mitsuba_plugins.analytic import held, safe_power
 from mitsuba_plugins.footprint import probes
-from mitsuba_plugins.lookup import Neighbour, PairTable, read_packets, texel_stencil, wide
+from mitsuba_plugins.lookup import Neighbour, texel_stencil
+from mitsuba_plugins.tables import PairTable, read_packets, wide
 
 #: Sums are split at multiples of this: their upper parts add up without rounding. The channels and levels of a dark
 #: value cancel, and the rounding of a plain sum would then show; see shaders/lib/careful_sum.glsl.

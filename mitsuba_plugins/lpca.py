@@ -5,7 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_plugins.lookup import PairTable, read_packets, texel_stencil, wide
+from mitsuba_plugins.lookup import texel_stencil
+from mitsuba_plugins.tables import PairTable, read_packets, wide
 
 
 class Evaluator:

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from btfref.representations.factored import raised
-from mitsuba_plugins.lookup import HALF_LIMIT, HALF_SCALE, HALF_SHIFT, read_packets, wide, widened
+from mitsuba_plugins.tables import HALF_LIMIT, HALF_SCALE, HALF_SHIFT, read_packets, wide, widened
 
 
 def half_difference(w_light, w_view):

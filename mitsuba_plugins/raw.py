@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_plugins.lookup import PairTable, texel_stencil
+from mitsuba_plugins.lookup import texel_stencil
+from mitsuba_plugins.tables import PairTable
 
 
 class Evaluator:

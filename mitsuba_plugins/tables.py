@@ -1,0 +1,193 @@
+"""Dr.Jit tables of direction pairs, and packets of values.
+
+Everything here is recorded, never executed per sample: no data-dependent Python control flow.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+#: Half tables are multiplied by this power of two when they are packed: the smallest subnormal half becomes normal.
+HALF_SHIFT = 2.0**10
+
+#: Largest value of a half table that survives the shift.
+HALF_LIMIT = 65504 / HALF_SHIFT
+
+#: Packed halves are widened by moving their bits into those of a float32; this makes up for the different exponent
+#: biases (2^112) and the shift. Exact for normal halves; CPUs in flush-to-zero mode would lose subnormal ones.
+HALF_SCALE = 2.0**112 / HALF_SHIFT
+
+
+#: Entries up to this many values are blended in straight-line code; wider ones loop over views, since the time to
+#: compile a kernel grows faster than its length, and the longer code of 16 values is also a fifth slower to run.
+UNROLLED_WIDTH = 8
+
+
+def tensor(array):
+    """A Dr.Jit tensor of the array's own type (float16, float32 or uint32); uint8 in words of four codes."""
+    array = np.ascontiguousarray(array)
+    if array.dtype == np.uint8:
+        array = array.view("<u4").astype(np.uint32)
+    kind = {"float16": mi.TensorXf16, "float32": mi.TensorXf, "uint32": mi.TensorXu}[array.dtype.name]
+    return kind(array)
+
+
+class PairTable:
+    """Blend of the entries of a table over direction pairs: the inner loop of every tabulated method.
+
+    Parameters
+    ----------
+    values : TensorXf or TensorXf16, shape (outer, n_views, n_lights, width)
+        ``width`` a multiple of 4.
+    following : ndarray of int, shape (n_lights,), or None
+        The next light on each light's ring.
+
+    Notes
+    -----
+    Gathers dominate the cost, and their cost is the number of 32-bit words. Half tables are therefore kept as words
+    of two values: on ring grids the same value of a light and of the next light on its ring, so that one entry feeds
+    two of the four lights of a lookup; elsewhere two neighbouring values of an entry.
+    """
+
+    def __init__(self, values, following):
+        self.following = following
+        self.update(values)
+
+    def update(self, values):
+        """Take new values; differentiable ones are kept as they are, so that gradients reach them."""
+        self.outer, self.n_views, self.n_lights, self.width = values.shape
+        self.words, self.values = None, None
+        packable = dr.type_v(values.array) == dr.VarType.Float16 and not dr.grad_enabled(values.array)
+        halves = values.numpy() if packable else None
+        if not packable or np.abs(halves).max() > HALF_LIMIT:
+            self.values = wide(values)
+            return
+        halves = (halves * np.float16(HALF_SHIFT)).view(np.uint16)
+        if self.following is None:
+            words = np.ascontiguousarray(halves).view(np.uint32)
+        else:
+            words = halves[..., self.following, :].astype(np.uint32) << 16
+            words |= halves
+        self.words = dr.reinterpret_array(mi.Float, mi.UInt32(words.ravel()))
+        dr.eval(self.words)
+
+    def combine(self, outer, views, lights, coefficients, active=True, total=None):
+        """Interpolate over views and lights, and combine the colours of an entry linearly.
+
+        Parameters
+        ----------
+        outer : UInt32
+            Index of the outermost axis.
+        views, lights : list of Neighbour
+        coefficients : list of Float
+            One for each colour of an entry (three values each); fewer than the entry holds ignore the rest.
+        active : Bool
+        total : optional
+            What the sum starts from; default: nothing.
+
+        Returns
+        -------
+        Color3f
+            ``Σ_pairs weight Σ_j coefficient_j colour_j``.
+        """
+        if self.words is not None:
+            # Applied first: unscaled halves times small weights would underflow.
+            coefficients = [c * HALF_SCALE for c in coefficients]
+        outer = outer * self.n_views
+        pairs = [pair for neighbour in views for pair in neighbour.single()]
+        total = mi.Color3f(0) if total is None else total
+        if self.words is None or self.width <= UNROLLED_WIDTH:
+            for view, weight in pairs:
+                total = self._add_view(total, outer + view, weight, lights, coefficients, active)
+            return total
+
+        def body(step, total):
+            view, weight = pairs[0]
+            for i, (other, other_weight) in enumerate(pairs[1:], 1):
+                view, weight = dr.select(step == i, other, view), dr.select(step == i, other_weight, weight)
+            return step + 1, self._add_view(total, outer + view, weight, lights, coefficients, active)
+
+        return dr.while_loop(
+            (mi.UInt32(0), total), lambda step, total: step < len(pairs), body, label="views"
+        )[1]
+
+    def _blend(self, total, values, coefficients, weight):
+        """``total`` plus the weighted combination of an entry's values; by default RGB colours back to back."""
+        return _add(total, values, coefficients, weight)
+
+    def _needed(self, coefficients):
+        """How many of an entry's values these coefficients use."""
+        return 3 * len(coefficients)
+
+    def _add_view(self, total, view, weight, lights, coefficients, active):
+        """``total`` plus the contribution of one view, interpolated over lights."""
+        base = view * self.n_lights
+        for light in lights:
+            if self.words is not None and self.following is not None:
+                words = read_packets(self.words, base + light.index, self.width, active)
+                halves = [widened(word) for word in words[: self._needed(coefficients)]]
+                total = self._blend(total, [low for low, _ in halves], coefficients, weight * light.weight)
+                total = self._blend(
+                    total, [high for _, high in halves], coefficients, weight * light.following_weight
+                )
+                continue
+            for index, light_weight in light.single():
+                total = self._blend(
+                    total, self._values(base + index, active), coefficients, weight * light_weight
+                )
+        return total
+
+    def _values(self, entry, active):
+        """The values of an entry one by one, not yet multiplied by ``HALF_SCALE``."""
+        if self.words is None:
+            return [mi.Float(value) for value in read_packets(self.values, entry, self.width, active)]
+        return [
+            half
+            for word in read_packets(self.words, entry, self.width // 2, active)
+            for half in widened(word)
+        ]
+
+
+def widened(word):
+    """The two halves of a word as float32, both to be multiplied by ``HALF_SCALE``."""
+    word = dr.reinterpret_array(mi.UInt32, word)
+    low = dr.reinterpret_array(mi.Float, ((word << 13) & 0x0FFFE000) | ((word << 16) & 0x80000000))
+    high = dr.reinterpret_array(mi.Float, ((word >> 3) & 0x0FFFE000) | (word & 0x80000000))
+    return low, high
+
+
+def _add(total, values, coefficients, weight):
+    """``total + weight Σ_j coefficient_j colour_j``: few live registers, whatever the number of coefficients."""
+    result = []
+    for channel in range(3):
+        value = values[channel] * coefficients[0]
+        for j, coefficient in enumerate(coefficients[1:], 1):
+            value = dr.fma(values[3 * j + channel], coefficient, value)
+        result.append(dr.fma(value, weight, total[channel]))
+    return mi.Color3f(*result)
+
+
+def wide(values):
+    """Values of a table as float32, which is read in packets; gradients pass the conversion."""
+    result = mi.Float(values.array)
+    dr.eval(result)
+    return result
+
+
+def read_packets(array, entry, width, active=True):
+    """``width`` consecutive values of entry ``entry``, gathered in the largest packets that fit."""
+    result = []
+    while len(result) < width:
+        # Packets must be aligned to their own size.
+        if width % 16 == 0:
+            packet = dr.gather(mi.Matrix4f, array, entry * (width // 16) + len(result) // 16, active)
+            result += [packet[row, column] for row in range(4) for column in range(4)]
+        elif width % 4:
+            packet = dr.gather(mi.Vector2f, array, entry * (width // 2) + len(result) // 2, active)
+            result += [packet.x, packet.y]
+        else:
+            packet = dr.gather(mi.Vector4f, array, entry * (width // 4) + len(result) // 4, active)
+            result += [packet[k] for k in range(4)]
+    return result
