@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from btfref.compare.tolerances import tolerance
-from btfref.render.reference import BATCHES, render
+from btfref.render.reference import BATCHES, loaded, tell_camera, traced
 
 #: Samples a pixel of the first round, and most of all rounds.
 FIRST, MOST = 256, 1 << 16
@@ -55,30 +55,24 @@ def converged(
     seeds = np.random.SeedSequence(seed).generate_state(32)
     mean = squared = 0.0
     done, count = 0, FIRST
-    for number in seeds:
-        found = render(
-            scene,
-            parameters=parameters,
-            spp=count,
-            seed=int(number),
-            size=size,
-            shadows=shadows,
-            grid=grid,
-            with_variance=True,
-        )
-        taken = found.meta["spp"]
-        # Rounds are weighted by their samples; so are the variances of their means, twice.
-        mean = (done * mean + taken * found.image.astype(float)) / (done + taken)
-        squared = (done**2 * squared + taken**2 * found.variance.astype(float)) / (done + taken) ** 2
-        done += taken
-        scale = float(np.abs(mean[mask]).mean()) if mask.any() else 0.0
-        noise = float(np.sqrt(squared[mask].mean())) / scale if scale > 0 else 0.0
-        if progress:
-            progress(min(done, most), most, f"reference, noise {noise:.2g} of {limit:.2g}")
-        if noise <= limit or done >= most:
-            break
-        # As many as the noise asks for, a tenth more because it is itself an estimate.
-        wanted = 1.1 * done * (noise / limit) ** 2 - done
-        count = int(np.clip(wanted, BATCHES, max(BATCHES, min(most - done, 8 * done))))
+    with loaded(scene, parameters, size=size) as made:
+        # One footprint for all rounds.
+        tell_camera(made, 1 / (grid or most**0.5))
+        for number in seeds:
+            found = traced(made, spp=count, seed=int(number), shadows=shadows, grid=grid, with_variance=True)
+            taken = found.meta["spp"]
+            # Rounds are weighted by their samples; so are the variances of their means, twice.
+            mean = (done * mean + taken * found.image.astype(float)) / (done + taken)
+            squared = (done**2 * squared + taken**2 * found.variance.astype(float)) / (done + taken) ** 2
+            done += taken
+            scale = float(np.abs(mean[mask]).mean()) if mask.any() else 0.0
+            noise = float(np.sqrt(squared[mask].mean())) / scale if scale > 0 else 0.0
+            if progress:
+                progress(min(done, most), most, f"reference, noise {noise:.2g} of {limit:.2g}")
+            if noise <= limit or done >= most:
+                break
+            # As many as the noise asks for, a tenth more because it is itself an estimate.
+            wanted = 1.1 * done * (noise / limit) ** 2 - done
+            count = int(np.clip(wanted, BATCHES, max(BATCHES, min(most - done, 8 * done))))
     meta = {**found.meta, "spp": done, "noise": noise, "noise_limit": limit}
     return replace(found, image=mean.astype(np.float32), variance=squared.astype(np.float32), meta=meta)

@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 #: Camera rays times samples that are traced at a time.
-LANES = 1 << 20
+LANES = 1 << 22
+
+#: Independent rounds a sub-pixel position at least: their spread is the variance.
+ROUNDS = 4
 
 
 def make_integrator(shadows):
@@ -68,7 +71,9 @@ def make_integrator(shadows):
 def regular(scene, grid, spp, seed, shadows):
     """Direct light at n × n regular sub-pixel positions: random are the light's directions alone.
 
-    Against a renderer that has the same positions no difference of texture sampling is left.
+    Against a renderer that has the same positions no difference of texture sampling is left. The samples of a round
+    are correlated multi-jittered (Kensler 2013, Pixar technical memo 13-01), which takes a fifth to a fifteenth of
+    their number under environments; rounds are independent.
 
     Parameters
     ----------
@@ -96,27 +101,31 @@ def regular(scene, grid, spp, seed, shadows):
     width, height = (int(n) for n in sensor.film().crop_size())
     pixels = width * height
     each = max(2, -(-spp // grid**2))
-    step = max(1, min(each, LANES // pixels))
+    # A square grid of strata.
+    step = int(max(1, min(each // min(each, ROUNDS), LANES // pixels)) ** 0.5) ** 2
     rounds = -(-each // step)
-    sampler = mi.load_dict({"type": "independent"})
+    sampler = mi.load_dict({"type": "multijitter", "sample_count": step})
+    sampler.set_samples_per_wavefront(step)
     seeds = iter(np.random.SeedSequence(seed).generate_state(rounds * grid**2))
     mean, variance = np.zeros((2, 3, pixels))
     for offset in grid_offsets(grid):
-        total, square = np.zeros((2, 3, pixels))
+        average, squares = np.zeros((2, 3, pixels))
         ray, _ = film_rays(sensor, offset)
         index = dr.arange(mi.UInt32, pixels * step) // step
         rays = mi.Ray3f(dr.gather(mi.Point3f, ray.o, index), dr.gather(mi.Vector3f, ray.d, index))
         rays.maxt = dr.gather(mi.Float, ray.maxt, index)
-        for _ in range(rounds):
+        for done in range(rounds):
             sampler.seed(int(next(seeds)), pixels * step)
             value, _, _ = integrator.sample(scene, sampler, rays, None, mi.Bool(True))
-            sums = [dr.block_sum(v, step) for v in value], [dr.block_sum(v * v, step) for v in value]
+            sums = [dr.block_sum(v, step) for v in value]
             dr.eval(sums)
-            total += np.array([np.array(s) for s in sums[0]], float)
-            square += np.array([np.array(s) for s in sums[1]], float)
-        n = rounds * step
-        mean += total / n / grid**2
-        variance += np.maximum(square / n - (total / n) ** 2, 0) / (n - 1) / grid**4
+            # Welford: rounds differ by little, sums of squares would lose it.
+            found = np.array([np.array(s) for s in sums], float) / step
+            change = found - average
+            average += change / (done + 1)
+            squares += change * (found - average)
+        mean += average / grid**2
+        variance += squares / (rounds - 1) / rounds / grid**4
     shape = height, width, 3
     images = (a.T.reshape(shape).astype(np.float32) for a in (mean, variance))
     return *images, rounds * step * grid**2

@@ -96,31 +96,65 @@ def render(
             scene, parameters, lights=lit, grid=noise_free or 4, size=size, margin=MARGIN if lit else None
         )
     with loaded(scene, parameters, variant=variant, size=size, kept=kept) as made:
-        tell_camera(
-            made, 1 / (noise_free or grid) if noise_free or grid else (spp or _sample_count(made)) ** -0.5
+        found = traced(
+            made,
+            spp=spp,
+            seed=seed,
+            noise_free=noise_free,
+            shadows=shadows,
+            with_variance=with_variance,
+            grid=grid,
         )
-        start = time.perf_counter()
-        if noise_free is not None:
-            image, variance = _noise_free(made, noise_free, shadows), None
-            settings = {"noise_free": noise_free, "shadows": shadows, "integrator": "noise-free direct"}
-        elif grid is not None:
-            from btfref.render.direct_light import regular
-
-            image, variance, spp = regular(made, grid, spp or _sample_count(made), seed, shadows)
-            settings = {"grid": grid, "spp": spp, "seed": seed, "shadows": shadows, "integrator": "direct"}
-        else:
-            image, variance, settings = _monte_carlo(made, spp, seed, with_variance, shadows)
-        seconds = time.perf_counter() - start
-    settings["not_finite"] = lost = int(np.count_nonzero(~np.isfinite(image)))
+    lost = found.meta["not_finite"]
     if lost and (debug or kept):
         cause = "needed maps that were not loaded; render with all maps" if kept else "are no numbers"
         raise BtfrefError(f"{lost} channels {cause}")
     if kept:
-        settings["maps"] = {
+        found.meta["maps"] = {
             file: {k: len(v) for k, v in chosen.items() if v is not None} for file, chosen in kept.items()
         }
-    facts = {"renderer": "mitsuba", "variant": variant, "rfilter": "box", "component_format": "float32"}
-    return RenderResult(image, variance, {**facts, **settings, "seconds": seconds, **_versions()})
+    return found
+
+
+def traced(made, *, spp=None, seed=0, noise_free=None, shadows=True, with_variance=False, grid=None):
+    """A picture of a scene that is `loaded`; further ones cost no loading.
+
+    Parameters
+    ----------
+    made : mitsuba.Scene
+    spp, seed, noise_free, shadows, with_variance, grid
+        As of `render`.
+
+    Returns
+    -------
+    RenderResult
+    """
+    import mitsuba as mi
+
+    spp = spp or _sample_count(made)
+    tell_camera(made, 1 / (noise_free or grid or spp**0.5))
+    start = time.perf_counter()
+    if noise_free is not None:
+        image, variance = _noise_free(made, noise_free, shadows), None
+        settings = {"noise_free": noise_free, "shadows": shadows, "integrator": "noise-free direct"}
+    elif grid is not None:
+        from btfref.render.direct_light import regular
+
+        image, variance, spp = regular(made, grid, spp, seed, shadows)
+        settings = {"grid": grid, "spp": spp, "seed": seed, "shadows": shadows, "integrator": "direct"}
+    else:
+        image, variance, settings = _monte_carlo(made, spp, seed, with_variance, shadows)
+    facts = {
+        "renderer": "mitsuba",
+        "variant": mi.variant(),
+        "rfilter": "box",
+        "component_format": "float32",
+        **settings,
+        "not_finite": int(np.count_nonzero(~np.isfinite(image))),
+        "seconds": time.perf_counter() - start,
+        **_versions(),
+    }
+    return RenderResult(image, variance, facts)
 
 
 class loaded:  # noqa: N801 - a context manager that reads as a verb
@@ -221,7 +255,6 @@ def _monte_carlo(scene, spp, seed, with_variance, shadows):
 
     from btfref.render.direct_light import make_integrator
 
-    spp = spp or _sample_count(scene)
     integrator = scene.integrator() if shadows else make_integrator(shadows=False)
     if integrator is None:
         raise InputError("the scene has no integrator", field="integrator", expected="such as path")
