@@ -130,7 +130,8 @@ def demand(
     InputError
         For a scene that cannot be read.
     """
-    from btfref.render.reference import film_rays, grid_offsets, loaded
+    from btfref.render.camera import film_rays, grid_offsets
+    from btfref.render.reference import loaded
     from btfref.render.scene import read_scene
 
     description = read_scene(scene, parameters, size=size, missing_btf=shape is not None)

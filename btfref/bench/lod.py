@@ -147,7 +147,7 @@ def _cost(path, rounds, tell):
     """Fetches and times of a plane that fills the picture, near and far."""
     import drjit as dr
 
-    from btfref.render import reference
+    from btfref.render import camera, reference
     from btfref.render.realtime import Renderer, realtime
     from btfref.render.scene import read_scene
     from btfref.scenes import scene_file
@@ -170,18 +170,18 @@ def _cost(path, rounds, tell):
         tasks = {}
         for k, p in parameters.items():
             made = stack.enter_context(reference.loaded(file, p, size=LARGE))
-            reference.tell_camera(made, 1.0)
-            tasks[k] = _reference_task(reference, dr, made)
+            camera.tell_camera(made, 1.0)
+            tasks[k] = _reference_task(camera, reference, dr, made)
         raw["Mitsuba"] = interleaved(tasks, rounds)
     times = {name: summary(t, "near") for name, t in raw.items()}
     return {"fetches": fetches | {"ratio": fetches["far"] / fetches["near"]}, "times": times}, raw
 
 
-def _reference_task(reference, dr, scene):
+def _reference_task(camera, reference, dr, scene):
     """Noise-free shading, one sample a pixel."""
 
     def task():
-        ray, _ = reference.film_rays(scene.sensors()[0], (0.5, 0.5))
+        ray, _ = camera.film_rays(scene.sensors()[0], (0.5, 0.5))
         dr.eval(reference.direct(scene, ray, False))
         dr.sync_thread()
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.render.reference import film_rays, grid_offsets, loaded
+from btfref.render.camera import film_rays, grid_offsets
+from btfref.render.reference import loaded
 
 BACKGROUND, INTERIOR, SILHOUETTE, MESOSTRUCTURE = 0, 1, 2, 3
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from btfref.compare.tolerances import tolerance
-from btfref.render.reference import BATCHES, loaded, tell_camera, traced
+from btfref.render.camera import tell_camera
+from btfref.render.reference import BATCHES, loaded, traced
 
 #: Samples a pixel of the first round, and most of all rounds.
 FIRST, MOST = 256, 1 << 16

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from btfref.render.camera import film_rays, grid_offsets
+
 #: Camera rays times samples that are traced at a time.
 LANES = 1 << 22
 
@@ -94,8 +96,6 @@ def regular(scene, grid, spp, seed, shadows):
     """
     import drjit as dr
     import mitsuba as mi
-
-    from btfref.render.reference import film_rays, grid_offsets
 
     integrator, sensor = make_integrator(shadows), scene.sensors()[0]
     width, height = (int(n) for n in sensor.film().crop_size())

@@ -14,7 +14,8 @@ import time
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.render.reference import film_rays, loaded
+from btfref.render.camera import film_rays
+from btfref.render.reference import loaded
 from btfref.render.result import RenderResult
 from btfref.render.scene import read_scene
 

@@ -113,7 +113,8 @@ def visible_points(scene, description, *, parameters=None, size=None, grid=4):
     InputError
         For a shape without a BTF.
     """
-    from btfref.render.reference import film_rays, grid_offsets, loaded
+    from btfref.render.camera import film_rays, grid_offsets
+    from btfref.render.reference import loaded
 
     for mesh in description.meshes:
         if mesh.material is None:
