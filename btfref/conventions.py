@@ -17,6 +17,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from btfref.numerics.precision import real
+
 #: Version of the file schemas; readers refuse a newer one.
 SCHEMA_VERSION = 1
 
@@ -62,7 +64,7 @@ def valid_directions(w):
         NaN, infinite and clearly unnormalised vectors (length outside of ½ … 2) count as invalid: their value is
         exactly 0. :func:`malformed` counts them.
     """
-    w = np.asarray(w, float)
+    w = real(w)
     low, high = SQUARED_LENGTHS
     with np.errstate(invalid="ignore", over="ignore"):
         square = np.einsum("...i,...i->...", w, w)
@@ -81,15 +83,17 @@ def malformed(uv, w_light, w_view):
     -------
     dict of str to int
         ``directions``: lookups with a vector that is not finite or clearly not of unit length; their value is 0.
-        ``coordinates``: lookups with ``uv`` that is not finite; it counts as 0.
+        ``coordinates``: lookups with ``uv`` that is not finite; it counts as 0. Ports count alike:
+        `mitsuba_plugins.lookup.malformed`, ``shaders/lib/malformed.glsl``.
     """
     low, high = SQUARED_LENGTHS
     unit = True
     with np.errstate(invalid="ignore", over="ignore"):
         for w in (w_light, w_view):
-            square = np.einsum("...i,...i->...", np.asarray(w, float), np.asarray(w, float))
+            w = real(w)
+            square = np.einsum("...i,...i->...", w, w)
             unit = unit & (square > low) & (square < high)
-    finite = np.isfinite(np.asarray(uv, float)).all(-1)
+    finite = np.isfinite(real(uv)).all(-1)
     return {"directions": int(np.count_nonzero(~unit)), "coordinates": int(np.count_nonzero(~finite))}
 
 
@@ -111,14 +115,14 @@ def texel_stencil(uv, shape, filter_type):
     weight : ndarray of float64, shape (..., T)
         Non-negative, sum 1.
     """
-    uv = np.asarray(uv, float)
+    uv = real(uv)
     uv = np.where(np.isfinite(uv), uv, 0.0)
     size = np.array([shape[1], shape[0]])
     # The fraction is taken first, so that large coordinates lose no more than they must.
-    position = (uv - np.floor(uv)) * size
+    position = (uv - np.floor(uv)) * real(size)
     if filter_type == "nearest":
         column, row = np.moveaxis(np.minimum(position.astype(np.int64), size - 1), -1, 0)
-        return (row * shape[1] + column)[..., None], np.ones((*uv.shape[:-1], 1))
+        return (row * shape[1] + column)[..., None], np.ones((*uv.shape[:-1], 1), uv.dtype)
     if filter_type != "bilinear":
         raise ValueError(f"filter_type must be one of {FILTER_TYPES}, got {filter_type!r}")
     position = position - 0.5

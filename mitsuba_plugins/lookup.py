@@ -12,12 +12,30 @@ import numpy as np
 from btfref.conventions import LEAST_Z, SQUARED_LENGTHS
 from btfref.numerics.interpolation import MISSING
 
+#: The largest finite float32.
+LARGEST = float(np.finfo(np.float32).max)
+
 
 def valid_directions(w):
     """As :func:`btfref.conventions.valid_directions`."""
     low, high = SQUARED_LENGTHS
     square = dr.squared_norm(w)
     return (w.z >= LEAST_Z) & (square > low) & (square < high)
+
+
+def malformed(uv, w_light, w_view):
+    """Where a lookup asks for what is none, as :func:`btfref.conventions.malformed` counts it.
+
+    Returns
+    -------
+    directions, coordinates : Bool
+    """
+    low, high = SQUARED_LENGTHS
+    squares = [dr.squared_norm(w) for w in (w_light, w_view)]
+    unit = (squares[0] > low) & (squares[0] < high) & (squares[1] > low) & (squares[1] < high)
+    # A comparison, which FastMath keeps: tests for NaN it may take out.
+    finite = (dr.abs(uv.x) <= LARGEST) & (dr.abs(uv.y) <= LARGEST)
+    return ~unit, ~finite
 
 
 #: π/4 as a sum of two float32: differences to a tabulated angle keep float accuracy.

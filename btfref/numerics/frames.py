@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from btfref.numerics.precision import real
+
 #: Length of interpolated cosine and sine below which tangents of all directions meet: there is no turn to speak of, and
 #: float32 would make one up (its rounding of 6e-8 turns a tangent by 6e-6 at this length).
 ROTATION_FLOOR = 0.01
@@ -66,7 +68,7 @@ def surface_frame(surface):
     tangent, bitangent, normal : ndarray, shape (N, 3)
         Orthonormal. Without rotation the tangent is x, projected to the tangent plane.
     """
-    sx, sy, cosine, sine = np.asarray(surface, float).T
+    sx, sy, cosine, sine = real(surface).T
     one = np.ones_like(sx)
     normal = np.stack([-sx, -sy, one], -1) / np.sqrt(1 + sx * sx + sy * sy)[:, None]
     # (1 − n_x², −n_x n_y, −n_x n_z) up to its length, with the cancellation taken out.

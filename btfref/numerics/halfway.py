@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from btfref.numerics.precision import real
+
 
 def half_frame(h):
     """Tangent and bitangent at the half vector, shape (..., 3) -> two of (..., 3).
@@ -19,7 +21,7 @@ def half_frame(h):
     h : array_like
         Unit vectors with z ≥ 0.
     """
-    x, y, z = np.moveaxis(np.asarray(h, float), -1, 0)
+    x, y, z = np.moveaxis(real(h), -1, 0)
     a = 1 / (1 + z)
     tangent = np.stack([1 - x * x * a, -x * y * a, -x], -1)
     bitangent = np.stack([-x * y * a, 1 - y * y * a, -y], -1)
@@ -39,11 +41,11 @@ def half_difference(w_light, w_view):
     h, d : ndarray, shape (..., 3)
         Unit vectors with z ≥ 0: h in the surface's frame, d (the light) in that of h.
     """
-    w_light, w_view = np.broadcast_arrays(np.asarray(w_light, float), np.asarray(w_view, float))
+    w_light, w_view = np.broadcast_arrays(real(w_light), real(w_view))
     h = w_light + w_view
     length = np.linalg.norm(h, axis=-1, keepdims=True)
     # Opposite directions on the horizon have no half vector; any will do there, where B is zero.
-    h = np.where(length > 0, h / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
+    h = np.where(length > 0, h / np.where(length > 0, length, 1), real([0.0, 0.0, 1.0]))
     tangent, bitangent = half_frame(h)
     d = np.stack([(w_light * axis).sum(-1) for axis in (tangent, bitangent, h)], -1)
     return h, d

@@ -15,6 +15,8 @@ from functools import cached_property
 
 import numpy as np
 
+from btfref.numerics.precision import real
+
 #: Tiles that a ray may travel sideways: what bounds the steps at grazing. Steeper than that it never is: its tangent is
 #: held at this limit, which is part of the definition. 4 tiles through a field 0.15 deep are 88° from the normal.
 MAXIMUM_TRAVEL = 4.0
@@ -115,7 +117,7 @@ class HeightField:
 
     def tangents(self, w):
         """``w_xy / w_z``, held at :attr:`tangent_limit`; shape (N, 3) -> (N, 2)."""
-        w = np.asarray(w, float)
+        w = real(w)
         across = np.hypot(w[:, 0], w[:, 1])
         return w[:, :2] / np.maximum(w[:, 2], across / self.tangent_limit)[:, None]
 
@@ -133,7 +135,7 @@ class HeightField:
         -------
         Hit
         """
-        size = np.array([self.shape[1], self.shape[0]])
+        size = real([self.shape[1], self.shape[0]])
         uv = np.where(np.isfinite(uv), uv, 0.0)
         tangent = self.tangents(w)
         position = (uv - np.floor(uv)) * size - 0.5 + self.top * tangent * size
@@ -142,16 +144,18 @@ class HeightField:
         n = len(uv)
         travel = -self.depth * tangent * size
         s, crossed = self._march(
-            cell.astype(np.int64), start, travel, np.full(n, self.top), np.full(n, -self.depth)
+            cell.astype(np.int64), start, travel, real(np.full(n, self.top)), real(np.full(n, -self.depth))
         )
         return self._hit(cell.astype(np.int64), start, travel, np.minimum(s, 1), crossed)
 
     def points(self, uv):
         """Points of the surface above positions of the tile, shape (N, 2) -> Hit."""
-        position = np.asarray(uv, float) * [self.shape[1], self.shape[0]] - 0.5
+        position = real(uv) * real([self.shape[1], self.shape[0]]) - 0.5
         cell = np.floor(position)
         zero = np.zeros_like(position)
-        return self._hit(cell.astype(np.int64), position - cell, zero, np.zeros(len(position)), zero)
+        return self._hit(
+            cell.astype(np.int64), position - cell, zero, np.zeros(len(position), zero.dtype), zero
+        )
 
     def lit(self, hit, w):
         """Whether points see a direction.
@@ -173,7 +177,9 @@ class HeightField:
         rest = np.flatnonzero(~result)
         if len(rest):
             hit = hit[rest]
-            travel = rise[rest, None] * self.tangents(np.asarray(w)[rest]) * [self.shape[1], self.shape[0]]
+            travel = (
+                rise[rest, None] * self.tangents(np.asarray(w)[rest]) * real([self.shape[1], self.shape[0]])
+            )
             s, _ = self._march(hit.cell, hit.local, travel, hit.height, rise[rest], lift)
             result[rest] = s > 1
         return result
@@ -187,7 +193,7 @@ class HeightField:
 
     def _patch(self, column, row, a, b):
         """Height at (a, b) of a patch, and its coefficients of a, b and ab."""
-        h00, h10, h01, h11 = np.moveaxis(self.cells[row, column].astype(float), -1, 0)
+        h00, h10, h01, h11 = np.moveaxis(real(self.cells[row, column]), -1, 0)
         hx, hy = h10 - h00, h01 - h00
         hxy = (h11 - h10) - hy
         return h00 + hx * a + (hy + hxy * a) * b, hx, hy, hxy
@@ -204,14 +210,15 @@ class HeightField:
         lift : float, optional
             Of shadow rays, which start on the surface: what they are raised by.
         """
-        n = len(start)
-        hit, crossed_at_hit = np.full(n, np.inf), np.zeros((n, 2))
+        n, kind = len(start), start.dtype
+        hit, crossed_at_hit = np.full(n, np.inf, kind), np.zeros((n, 2), kind)
         rows, columns = self.shape
-        moving = travel != 0
-        forward = (travel > 0).astype(float)
+        # What is below the smallest normal float32 moves no ray, and has no finite inverse there.
+        moving = np.abs(travel) > 2.0**-126
+        forward = (travel > 0).astype(kind)
         inverse = np.where(moving, 1 / np.where(moving, travel, 1), 0)
         active = np.arange(n)
-        s, crossed = np.zeros(n), np.zeros((n, 2))
+        s, crossed = np.zeros(n, kind), np.zeros((n, 2), kind)
         first = True
         while len(active):
             dx, dy = travel[active].T
@@ -220,7 +227,7 @@ class HeightField:
             height, hx, hy, hxy = self._patch(index[:, 0] % columns, index[:, 1] % rows, *local.T)
             f0 = z0[active] + s * dz[active] - height
             if lift is not None:
-                f0 = np.full(len(active), lift) if first else f0 + lift
+                f0 = np.full(len(active), lift, kind) if first else f0 + lift
             f1 = dz[active] - (hx + hxy * local[:, 1]) * dx - (hy + hxy * local[:, 0]) * dy
             f2 = -hxy * dx * dy
             border = np.where(
@@ -236,7 +243,7 @@ class HeightField:
             last = ~found & ~going
             crossed_at_hit[active[last]] = crossed[last]
             across_x = border[going, 0] <= border[going, 1]
-            step = np.where(travel[active[going]] > 0, 1.0, -1.0)
+            step = np.where(travel[active[going]] > 0, kind.type(1), kind.type(-1))
             step[:, 0] *= across_x
             step[:, 1] *= ~across_x
             crossed = crossed[going] + step

@@ -15,6 +15,7 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.parabolic import hemisphere_to_square
+from btfref.numerics.precision import real
 
 #: Columns of a row of ``triangles``: vertices a and b, dual normals of a, b and c, indices, neighbours, padding.
 TRIANGLE_FLOATS = 24
@@ -54,11 +55,11 @@ class RingInterpolation:
         index : ndarray of int64, shape (..., 4)
         weight : ndarray of float64, shape (..., 4)
         """
-        x, y, z = np.moveaxis(np.asarray(w, float), -1, 0)
+        x, y, z = np.moveaxis(real(w), -1, 0)
         # acos(z) would lose half of the digits near the pole.
         theta = np.arctan2(np.hypot(x, y), z)
         turn = np.arctan2(y, x) / (2 * np.pi)
-        table = np.asarray(self.rings, float)
+        table = real(self.rings)
         last = len(table) - 1
         low = np.clip(np.searchsorted(table[:, 0], theta, side="right") - 1, 0, last)
         high = np.minimum(low + 1, last)
@@ -110,8 +111,8 @@ class TriangleInterpolation:
 
     def locate(self, w):
         """Triangle that holds each direction, by walking from the start cell; shape (..., 3) -> (...)."""
-        w = np.asarray(w, float)
-        table = np.asarray(self.triangles, float)
+        w = real(w)
+        table = real(self.triangles)
         square = hemisphere_to_square(w)
         n = len(self.cells)
         cell = np.clip(((square + 1) * (0.5 * n)).astype(np.int64), 0, n - 1)
@@ -129,8 +130,8 @@ class TriangleInterpolation:
 
     def stencil(self, w, *, hold=True):
         """Neighbouring samples and weights, as :meth:`RingInterpolation.stencil`, with three samples."""
-        w = np.asarray(w, float)
-        row = np.asarray(self.triangles, float)[self.locate(w)]
+        w = real(w)
+        row = real(self.triangles)[self.locate(w)]
         weight = np.maximum(barycentric(row, w), 0)
         beyond = row[..., 17] < 0
         weight[..., 2] = np.where(beyond, 0, weight[..., 2])

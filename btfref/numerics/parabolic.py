@@ -11,13 +11,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from btfref.numerics.precision import real
+
 
 def hemisphere_to_square(w):
     """Parabolic coordinates ``(s, t) = (w_x, w_y) / (1 + w_z)``, shape (..., 3) -> (..., 2).
 
     The hemisphere fills the unit disc; directions below the horizon fall outside of it.
     """
-    w = np.asarray(w, float)
+    w = real(w)
     return w[..., :2] / (1 + w[..., 2:])
 
 
@@ -78,7 +80,7 @@ def bilinear_stencil(w, n):
     weight : ndarray of float64, shape (..., 4)
         Non-negative, sum 1.
     """
-    w = np.asarray(w, float)
+    w = real(w)
     scale = np.linalg.norm(w, axis=-1) + w[..., 2]
     st = w[..., :2] / np.where(scale > 0, scale, 1)[..., None]
     position = np.clip(st * (n / 2) + (n - 1) / 2, 0, n - 1)

@@ -9,6 +9,7 @@ import numpy as np
 
 from btfref.numerics.levenberg import backend, fit_batch
 from btfref.numerics.powers import safe_power
+from btfref.numerics.precision import real
 
 #: Exponents that the fits start from: one lane each, the best wins.
 STARTS = (1.0, 4.0, 16.0, 64.0, 256.0)
@@ -41,7 +42,7 @@ def phong(parameters, w_light, w_view):
 
 def half_cosine(w_light, w_view):
     """Cosine between the normal and the half vector, n · h, of unit vectors, shape (..., 3), (..., 3) -> (...)."""
-    half = np.asarray(w_light, float) + np.asarray(w_view, float)
+    half = real(w_light) + real(w_view)
     return half[..., 2] / np.sqrt((half**2).sum(-1))
 
 

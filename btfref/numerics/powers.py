@@ -8,7 +8,11 @@ type of interest holds, so that no stored parameter can overflow. Ports: ``mitsu
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+
+from btfref.numerics.precision import real
 
 #: Bases below the smallest positive half count as zero, in every type: flushing of subnormal numbers then does not
 #: decide the result.
@@ -88,11 +92,11 @@ def unit_lobe(axis, light, n):
     ndarray of float64, shape (...)
         In [0, 1]; 0 where the cosine is not positive.
     """
-    d = np.asarray(axis, float) - np.asarray(light, float)
+    d = real(axis) - real(light)
     h = 0.5 * np.einsum("...i,...i->...", d, d)
     counts = 1 - h >= FLOOR
-    log = np.log1p(-np.where(counts, h, 0)) / np.log(2)
-    return _from_log(log, np.asarray(n, float), counts, np.dtype(float))
+    log = np.log1p(-np.where(counts, h, 0)) / math.log(2)
+    return _from_log(log, real(n), counts, log.dtype)
 
 
 def _from_log(log, exponent, counts, kind):

@@ -14,6 +14,7 @@ import numpy as np
 
 from btfref.conventions import FILTER_TYPES
 from btfref.errors import InputError
+from btfref.numerics.precision import real
 
 #: Kernels of the reduction. "binomial": (1 3 3 1)/8 for even sizes, centred between the two texels that become one.
 #: "box": (1 1 1)/3 about the first of the two (Ma et al. 2005), which shifts a level by half a texel of the finer one.
@@ -206,11 +207,11 @@ def level_weights(lod, n_levels):
         The coarsest level's weight is 1 for any λ.
     """
     lod = clamped_lod(lod, n_levels)
-    k = np.arange(n_levels).reshape(-1, *[1] * lod.ndim)
+    k = real(np.arange(n_levels)).reshape(-1, *[1] * lod.ndim)
     return np.clip(1 - lod + k, 0, 1)
 
 
 def clamped_lod(lod, n_levels):
     """λ within [0, n_levels − 1]; NaN counts as 0."""
-    lod = np.asarray(lod, float)
+    lod = real(lod)
     return np.clip(np.where(np.isnan(lod), 0.0, lod), 0, n_levels - 1)

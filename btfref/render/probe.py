@@ -39,6 +39,34 @@ def probe(rep, uv, w_light, w_view, lod=0.0, *, filter_type=None):
         return made.values()
 
 
+def probe_malformed(rep, uv, w_light, w_view):
+    """How many lookups the shader counts as malformed: what `btfref.conventions.malformed` counts in NumPy.
+
+    Parameters
+    ----------
+    rep : Representation
+    uv, w_light, w_view : array_like
+        As for :func:`probe`.
+
+    Returns
+    -------
+    dict of str to int
+        ``directions``, ``coordinates``.
+
+    Raises
+    ------
+    MissingDependencyError
+        Without an OpenGL driver.
+    """
+    points, _ = broadcast_points(uv, w_light, w_view)
+    found = np.zeros(2, int)
+    if len(points):
+        with probe_points(rep, points, result=("unusable", 2)) as made:
+            made.run()
+            found = made.values().sum(0).astype(int)
+    return dict(zip(("directions", "coordinates"), found.tolist(), strict=True))
+
+
 def probe_environment(rep, light, uv, w_view, to_world, *, filter_type=None):
     """Radiance of ``rep`` under an environment, computed by its shader.
 
@@ -74,27 +102,29 @@ def probe_environment(rep, light, uv, w_view, to_world, *, filter_type=None):
 
 
 class Probe:
-    """A vertex host on the GPU, with points to evaluate: ``value`` of each; a context manager.
+    """A vertex host on the GPU, with points to evaluate: a result of each; a context manager.
 
     Parameters
     ----------
     tables : btfref.render.gl.ShaderRepresentation
         Owned from here on.
     host : str
-        Vertex shader that writes ``value``.
+        Vertex shader that writes the result.
     names : dict of str to int
         Attributes in the order of the points' columns, and how many columns each has.
     points : ndarray of float32, shape (N, sum of the columns)
         N at least 1.
+    result : (str, int)
+        Name of the result, and how many floats it has.
     """
 
-    def __init__(self, tables, host, names, points):
+    def __init__(self, tables, host, names, points, result=("value", 3)):
         self.ctx = gl.context()
         self._owned, self._n = [tables], len(points)
         # Without a bound framebuffer transform feedback on a surfaceless context returns zeros, without an error.
         self._target = self._own(self.ctx.simple_framebuffer((1, 1)))
         self._target.use()
-        self._program = self._own(tables.program(self.ctx, host, varyings=("value",)))
+        self._program = self._own(tables.program(self.ctx, host, varyings=result[:1]))
         self._textures = tables.textures
         content, start = [], 0
         for name, width in names.items():
@@ -103,7 +133,8 @@ class Probe:
                 content.append((self._own(self.ctx.buffer(columns.tobytes())), f"{width}f", name))
             start += width
         self._vertices = self._own(self.ctx.vertex_array(self._program, content))
-        self._result = self._own(self.ctx.buffer(reserve=12 * self._n))
+        self._result = self._own(self.ctx.buffer(reserve=4 * result[1] * self._n))
+        self._width = result[1]
 
     def __enter__(self):
         return self
@@ -124,15 +155,15 @@ class Probe:
         self.ctx.finish()
 
     def values(self):
-        """What the last run found, float32 (N, 3)."""
-        return np.frombuffer(self._result.read(), np.float32).reshape(-1, 3).copy()
+        """What the last run found, float32 (N, width of the result)."""
+        return np.frombuffer(self._result.read(), np.float32).reshape(-1, self._width).copy()
 
 
-def probe_points(rep, points, *, filter_type=None):
+def probe_points(rep, points, *, filter_type=None, result=("value", 3)):
     """A :class:`Probe` of ``rep`` at rows of :func:`broadcast_points`; the caller runs and releases it."""
     names = {"uv": 2, "w_light": 3, "w_view": 3, "lod": 1}
     tables = gl.ShaderRepresentation.upload(gl.context(), rep, filter_type=filter_type)
-    return Probe(tables, "hosts/probe.vert", names, points)
+    return Probe(tables, "hosts/probe.vert", names, points, result)
 
 
 def _transformed(tables, host, names, points, uniforms=None):

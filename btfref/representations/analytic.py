@@ -7,6 +7,7 @@ the convention for lights beyond the last ring, so that nothing is extrapolated 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from btfref import conventions
 from btfref.errors import InputError
 from btfref.numerics import interpolation
+from btfref.numerics.precision import real
 from btfref.representations.guide import feature_views, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points
 
@@ -81,11 +83,11 @@ def held(w, edge):
     fade : ndarray, shape (...)
         ``z / edge`` where that is below 1, else 1.
     """
-    w = np.asarray(w, float)
+    w = real(w)
     z = w[..., 2]
     below = z < edge
     radius = np.hypot(w[..., 0], w[..., 1])
-    scale = np.where(below, np.sqrt(max(1 - edge * edge, 0)) / np.where(below, radius, 1), 1)
+    scale = np.where(below, math.sqrt(max(1 - edge * edge, 0)) / np.where(below, radius, 1), 1)
     raised = np.concatenate([w[..., :2] * scale[..., None], np.maximum(z, edge)[..., None]], -1)
     return raised, np.where(below, z / max(edge, 1e-30), 1)
 

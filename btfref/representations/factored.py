@@ -16,6 +16,7 @@ from btfref import conventions
 from btfref.numerics.factoring import map_operators
 from btfref.numerics.halfway import half_difference
 from btfref.numerics.parabolic import bilinear_stencil
+from btfref.numerics.precision import precision, real
 from btfref.representations.guide import N_GROUPS, feature_views, group_means, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points
 
@@ -81,16 +82,14 @@ class Representation(StoredMaps):
         return tuple(name for name in FACTORS if f"factor_{name}" in self.maps)
 
     def _scales(self):
-        """Scales of the terms of P · R and of Q · D, shapes (texel, term, 3), in float64."""
+        """Scales of the terms of P · R and of Q · D, shapes (texel, term, 3), as the definition computes."""
         constants = self.meta["constants"]
-        scale = decoded(self.maps["scale_map"], constants["scale_power"]) * self.maps["scale_peak"].astype(
-            float
-        )
+        scale = decoded(self.maps["scale_map"], constants["scale_power"]) * real(self.maps["scale_peak"])
         scale = scale.reshape(-1, *scale.shape[2:])
         if "half_scale" in self.maps:
             half = decoded(self.maps["half_scale"], constants["map_power"])
             return scale, half.reshape(-1, *half.shape[2:])
-        return scale, np.ones((len(scale), 1, 3))
+        return scale, np.ones((len(scale), 1, 3), scale.dtype)
 
     def factors(self, texels):
         """Factors of some texels with their scales, as :class:`~btfref.numerics.factoring.FactorOperators` reads them.
@@ -166,15 +165,15 @@ def index_slots(constants):
 def light_fade(w_light, cos_last):
     """``min(1, cos θ / cos θ_last)``: P holds its last ring, B falls to zero at the horizon."""
     if cos_last <= 1e-6:
-        return np.ones(np.shape(w_light)[:-1])
-    return np.minimum(np.asarray(w_light, float)[..., 2] / cos_last, 1)
+        return np.ones(np.shape(w_light)[:-1], precision())
+    return np.minimum(real(w_light)[..., 2] / cos_last, 1)
 
 
-def decoded(array, power, dtype=float):
+def decoded(array, power, dtype=None):
     """Values of a stored map: what is stored (of uint8 a 255th) to the ``power`` of 1 or 4."""
-    values = array.astype(dtype)
+    values = array.astype(precision() if dtype is None else dtype)
     if array.dtype == np.uint8:
-        values /= dtype(255)
+        values /= values.dtype.type(255)
     return raised(values, power)
 
 

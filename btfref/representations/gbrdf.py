@@ -21,6 +21,7 @@ from btfref.numerics.frames import surface_frame
 from btfref.numerics.heightfield import LIFT, HeightField
 from btfref.numerics.microfacets import geometry_factor, schlick, specular_albedo_bound
 from btfref.numerics.parabolic import bilinear_stencil
+from btfref.numerics.precision import computing_in, real
 from btfref.representations.guide import group_means, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points
 
@@ -82,9 +83,12 @@ class Representation(StoredMaps):
     @cached_property
     def port_tables(self):
         """What the ports and the definition read, by texel; see :meth:`port_arrays`."""
+        # Made once for all ports, in whatever precision a lookup computes.
+        with computing_in(np.float64):
+            scale = self.specular_scale
         turn = 2 * np.pi * self.maps["rotation"].astype(float)
         surface = np.concatenate([self.field.slopes, np.cos(turn), np.sin(turn)], -1)
-        gloss = np.stack([self.maps["material"][..., 0].astype(np.float32), self.specular_scale], -1)
+        gloss = np.stack([self.maps["material"][..., 0].astype(np.float32), scale], -1)
         return {
             "cells": self.field.cells,
             "surface": surface.astype(np.float32),
@@ -156,10 +160,10 @@ class Representation(StoredMaps):
         """
         index, weight = texel_weights(hit, self.field.shape, self.meta["filter_type"])
         flat = {name: table.reshape(-1, table.shape[-1]) for name, table in self.port_tables.items()}
-        surface = np.einsum("nt,ntk->nk", weight, flat["surface"][index].astype(float))
+        surface = np.einsum("nt,ntk->nk", weight, real(flat["surface"][index]))
         tangent, bitangent, normal = surface_frame(surface)
         cos_light = (w_light * normal).sum(-1)
-        value = np.zeros((len(index), 3))
+        value = np.zeros((len(index), 3), weight.dtype)
         if lit is None:
             lit = cos_light > 0
             lit[lit] = self.field.lit(hit[lit], w_light[lit])
@@ -168,7 +172,7 @@ class Representation(StoredMaps):
         if not lit.any():
             return value
         index, weight, cos_light = index[lit], weight[lit], cos_light[lit]
-        colour = flat["colour"][index].astype(float)
+        colour = real(flat["colour"][index])
         diffuse = np.einsum("nt,ntc->nc", weight, colour[..., :3]) * (cos_light / np.pi)[:, None]
         h = w_light[lit] + w_view[lit]
         length = np.linalg.norm(h, axis=-1, keepdims=True)
@@ -178,11 +182,11 @@ class Representation(StoredMaps):
         # Microfacets behind the surface reflect nothing.
         factor = np.where(local[:, 2] > 0, factor, 0)
         fresnel = schlick((w_light[lit] * h).sum(-1)[:, None], colour[..., 3])
-        share = weight * flat["gloss"][index, 1] * fresnel
+        share = weight * real(flat["gloss"][index, 1]) * fresnel
         material = flat["gloss"][index, 0].astype(np.int64)
         cell, cell_weight = bilinear_stencil(local, self.maps["ndf"].shape[1])
         table = self.maps["ndf"].reshape(len(self.maps["ndf"]), -1, 3)
-        p = np.einsum("nk,ntkc->ntc", cell_weight, table[material[:, :, None], cell[:, None]].astype(float))
+        p = np.einsum("nk,ntkc->ntc", cell_weight, real(table[material[:, :, None], cell[:, None]]))
         value[lit] = diffuse + factor[:, None] * np.einsum("nt,ntc->nc", share, p)
         return value
 
@@ -261,6 +265,6 @@ def texel_weights(hit, shape, filter_type):
     a, b = hit.local.T
     if filter_type == "nearest":
         column, row = np.where(a < 0.5, c0, c1), np.where(b < 0.5, r0, r1)
-        return (row * columns + column)[:, None], np.ones((len(a), 1))
+        return (row * columns + column)[:, None], np.ones((len(a), 1), a.dtype)
     index = np.stack([r0 * columns + c0, r0 * columns + c1, r1 * columns + c0, r1 * columns + c1], -1)
     return index, np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], -1)

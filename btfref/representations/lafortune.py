@@ -15,6 +15,7 @@ import numpy as np
 
 from btfref.numerics.levenberg import BatchFit, fit_batch
 from btfref.numerics.powers import FLOOR, safe_power
+from btfref.numerics.precision import real
 from btfref.representations import analytic
 from btfref.representations.lobe_start import exponent_limit
 from btfref.representations.lookup import base_meta, direction_arrays, positive_integer, stored
@@ -55,9 +56,9 @@ class Representation(analytic.AnalyticMaps):
 
 
 def flat_maps(maps):
-    """The maps of the texels by flat index, in float64; lobes as (n, k, 4)."""
+    """The maps of the texels by flat index, as the definition computes; lobes as (n, k, 4)."""
     names = [name for name in maps if not name.startswith(("view_", "light_"))]
-    flat = {name: maps[name].reshape(-1, maps[name].shape[-1]).astype(float) for name in names}
+    flat = {name: real(maps[name].reshape(-1, maps[name].shape[-1])) for name in names}
     flat["lobes"] = flat["lobes"].reshape(len(flat["lobes"]), -1, 4)
     return flat
 

@@ -10,6 +10,7 @@ import numpy as np
 from btfref.conventions import texel_stencil
 from btfref.numerics import interpolation
 from btfref.numerics.phong import phong
+from btfref.numerics.precision import real
 from btfref.numerics.pyramid import clamped_lod, expand_image, level_weights
 from btfref.numerics.ycbcr import TO_RGB
 from btfref.representations.analytic import held
@@ -59,15 +60,15 @@ class Representation(StoredMaps):
                 total[used] += share[used, None] * self._level(
                     k, uv[used], [p[used] for p in pairs], pair_weight[used]
                 )
-            return total @ TO_RGB.T
+            return total @ real(TO_RGB.T)
 
         return evaluate_points(lookup, uv, w_light, w_view, lod)
 
     def _mean(self, w_light, w_view, pairs, pair_weight):
         """μ' in Y, Cb, Cr, shape (N, 3)."""
         if "mean" in self.maps:
-            return np.einsum("nvl,nvlc->nc", pair_weight, self.maps["mean"][pairs].astype(float))
-        parameters, constants = self.maps["phong"][0].astype(float), self.meta["constants"]
+            return np.einsum("nvl,nvlc->nc", pair_weight, real(self.maps["mean"][pairs]))
+        parameters, constants = real(self.maps["phong"][0]), self.meta["constants"]
         light, fade = held(w_light, constants["light_edge"])
         view, _ = held(w_view, constants["view_edge"])
         result = np.broadcast_to(parameters[[0, 4, 5]], (len(w_light), 3)).copy()
@@ -79,10 +80,10 @@ class Representation(StoredMaps):
         level = self.meta["levels"][k]
         shape = level["rows"], level["columns"]
         texel, texel_weight = texel_stencil(uv, shape, self.meta["filter_type"])
-        weights = self.maps[f"weights_{k}"].astype(float)
+        weights = real(self.maps[f"weights_{k}"])
         weights = weights.reshape(-1, weights.shape[-1])
         coefficient = np.einsum("nt,ntk->nk", texel_weight, weights[texel])
-        table = self.maps[f"basis_{k}"][tuple(pairs)].astype(float)
+        table = real(self.maps[f"basis_{k}"][tuple(pairs)])
         product = coefficient * np.einsum("nvl,nvlk->nk", pair_weight, table)
         ends = np.cumsum([0, *level["components"]])
         return np.stack([product[:, a:b].sum(1) for a, b in pairwise(ends)], -1)

@@ -9,6 +9,7 @@ import numpy as np
 from btfref import conventions
 from btfref.errors import InputError
 from btfref.numerics import interpolation
+from btfref.numerics.precision import real
 
 #: Points evaluated at a time: bounds the memory of the gathered neighbourhoods.
 CHUNK = 1 << 14
@@ -97,8 +98,8 @@ def evaluate_points(lookup, uv, w_light, w_view, *scalars):
     -------
     ndarray of float64, shape (..., 3)
     """
-    uv, w_light, w_view = (np.asarray(a, float) for a in (uv, w_light, w_view))
-    scalars = [np.asarray(a, float) for a in scalars]
+    uv, w_light, w_view = (real(a) for a in (uv, w_light, w_view))
+    scalars = [real(a) for a in scalars]
     shape = np.broadcast_shapes(
         uv.shape[:-1], w_light.shape[:-1], w_view.shape[:-1], *(a.shape for a in scalars)
     )
@@ -106,14 +107,20 @@ def evaluate_points(lookup, uv, w_light, w_view, *scalars):
         np.broadcast_to(a, (*shape, a.shape[-1])).reshape(-1, a.shape[-1]) for a in (uv, w_light, w_view)
     )
     scalars = [np.broadcast_to(a, shape).reshape(-1) for a in scalars]
-    result = np.zeros((len(uv), 3))
+    result = None
     for start in range(0, len(uv), CHUNK):
         part = slice(start, start + CHUNK)
         valid = conventions.valid_directions(w_light[part]) & conventions.valid_directions(w_view[part])
         if not valid.any():
             continue
         points = (a[part][valid] for a in (uv, w_light, w_view, *scalars))
-        result[part][valid] = lookup(*points)
+        value = lookup(*points)
+        if result is None:
+            # In the precision that the lookup kept: single, where :func:`computing_in` asks for it.
+            result = np.zeros((len(uv), 3), value.dtype)
+        result[part][valid] = value
+    if result is None:
+        result = np.zeros((len(uv), 3), uv.dtype)
     return result.reshape(*shape, 3)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from btfref import conventions
 from btfref.numerics.clustering import leading_axes, local_pca
 from btfref.numerics.lowrank import range_basis, refined_basis, texel_matrix
+from btfref.numerics.precision import real
 from btfref.numerics.threads import one_blas_thread
 from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
@@ -56,7 +57,7 @@ class Representation(StoredMaps):
         basis = self.maps["basis"]
         cluster = self.maps["cluster"].reshape(-1)
         weights = self.maps["weights"].reshape(len(cluster), -1)
-        coefficient = np.concatenate([np.ones((len(weights), 1)), weights], 1)
+        coefficient = real(np.concatenate([np.ones((len(weights), 1)), weights], 1))
 
         def kernel(s):
             texel_coefficient = s.texel_weight[:, :, None] * coefficient[s.texel]
@@ -66,7 +67,7 @@ class Representation(StoredMaps):
                 s.view[:, None, :, None],
                 s.light[:, None, None, :],
             )
-            table = basis[index].astype(float)  # n, t, v, l, component, channel: advanced axes come first
+            table = real(basis[index])  # n, t, v, l, component, channel: advanced axes come first
             return np.einsum("ntk,nvl,ntvlkc->nc", texel_coefficient, s.pair_weight, table, optimize=True)
 
         return evaluate_tabulated(self, kernel, uv, w_light, w_view)

@@ -8,6 +8,7 @@ import numpy as np
 
 from btfref import conventions
 from btfref.errors import InputError
+from btfref.numerics.precision import real
 from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
     StoredMaps,
@@ -35,7 +36,7 @@ class Representation(StoredMaps):
 
         def kernel(s):
             index = (s.texel[:, :, None, None], s.view[:, None, :, None], s.light[:, None, None, :])
-            found = table[index].astype(float)
+            found = real(table[index])
             result = np.einsum("nt,nv,nl,ntvlc->nc", s.texel_weight, s.view_weight, s.light_weight, found)
             if partial and np.isnan(result).any():
                 raise InputError("a lookup needs texels that are not resident", field="texels")

@@ -18,6 +18,7 @@ import numpy as np
 
 from btfref.numerics.levenberg import fit_batch
 from btfref.numerics.powers import FLOOR, safe_power, unit_lobe
+from btfref.numerics.precision import real
 from btfref.representations import analytic
 from btfref.representations.lobe_start import exponent_limit, lobe_starts, tilted_starts
 from btfref.representations.lookup import base_meta, direction_arrays, positive_integer, stored
@@ -59,11 +60,11 @@ class Representation(analytic.AnalyticMaps):
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored. Never negative."""
         lobes = self._lobes()
-        colour = self.maps["colour"].reshape(-1, 4).astype(float)
+        colour = real(self.maps["colour"].reshape(-1, 4))
 
         def kernel(s):
             index = (s.texel[:, :, None], s.view[:, None, :])
-            value = lobe_sum(lobes[index].astype(float), s.w_light[:, None, None, None])
+            value = lobe_sum(real(lobes[index]), s.w_light[:, None, None, None])
             value = np.einsum("ntv,nt,nv->nt", value, s.texel_weight, s.view_weight)
             at = colour[s.texel]
             value += s.texel_weight * at[..., 3] * s.w_light[:, None, 2]

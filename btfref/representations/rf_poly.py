@@ -15,6 +15,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from btfref.numerics.precision import real
 from btfref.representations import analytic
 from btfref.representations.lookup import base_meta, direction_arrays, stored
 
@@ -45,10 +46,10 @@ class Representation(analytic.AnalyticMaps):
         """
         polynomial = self.maps["polynomial"]
         polynomial = polynomial.reshape(-1, *polynomial.shape[2:])
-        chroma = self.maps["chroma"].reshape(-1, 3).astype(float)
+        chroma = real(self.maps["chroma"].reshape(-1, 3))
 
         def kernel(s):
-            coefficient = polynomial[s.texel[:, :, None], s.view[:, None, :]].astype(float)
+            coefficient = real(polynomial[s.texel[:, :, None], s.view[:, None, :]])
             value = np.einsum("ntvk,nk->ntv", coefficient, terms(s.w_light))
             value = np.einsum("ntv,nt,nv->nt", value, s.texel_weight, s.view_weight)
             return np.einsum("nt,ntc->nc", value, chroma[s.texel])

@@ -12,6 +12,7 @@ import numpy as np
 
 from btfref import conventions
 from btfref.numerics.lowrank import range_basis, texel_matrix
+from btfref.numerics.precision import real
 from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
     StoredMaps,
@@ -44,7 +45,7 @@ class Representation(StoredMaps):
 
         def kernel(s):
             coefficient = np.einsum("nt,ntk->nk", s.texel_weight, weights[s.texel])
-            table = basis[:, s.view[:, :, None], s.light[:, None, :]].astype(float)
+            table = real(basis[:, s.view[:, :, None], s.light[:, None, :]])
             return np.einsum("nk,nvl,knvlc->nc", coefficient, s.pair_weight, table, optimize=True)
 
         return evaluate_tabulated(self, kernel, uv, w_light, w_view)

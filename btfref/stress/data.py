@@ -91,6 +91,29 @@ def _duplicates(values, rng):
     return flat[:, :, chosen].reshape(values.shape)
 
 
+def _relief(seed):
+    """Data that a height field explains: a g-BRDF of smooth bumps 0.1 deep, in two materials, at all its samples."""
+    from btfref.numerics.microfacets import isotropic_ndf
+    from btfref.representations.gbrdf_build import from_maps
+
+    rows, columns = SHAPE
+    v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
+    wave = np.sin(2 * np.pi * u) * np.sin(2 * np.pi * v)
+    checker = (0.5 + 0.5 * np.tanh(6 * wave))[..., None]
+    surface = from_maps(
+        (1 + wave) / 2,
+        height_min=-0.1,
+        diffuse=checker * [0.64, 0.24, 0.32] + (1 - checker) * [0.08, 0.12, 0.48],
+        material=(checker[..., 0] < 0.5).astype(int),
+        ndf=np.stack([isotropic_ndf(0.2), isotropic_ndf(0.5)]),
+        specular=[0.3, 0.1],
+    )
+    chosen = directions("ubo81")
+    uv, lights = np.stack([u, v], -1), chosen.vectors[:, None, None]
+    values = np.stack([surface.evaluate(uv, lights, view) for view in chosen.vectors]).astype(np.float32)
+    return SampledBTF(values, chosen, chosen, attributes={"mesostructure": "formula"})
+
+
 def scattered(seed, n=40):
     """``n`` random unit vectors of the upper hemisphere: no rings, no symmetry, shape (n, 3)."""
     rng = np.random.default_rng([seed, 2])
@@ -130,6 +153,7 @@ DATA = {
     "huge": ("bumpy times 1e8", _changed(lambda values, rng: values * 1e8, dtype="float32")),
     "tiny": ("bumpy times 1e-8", _changed(lambda values, rng: values * 1e-8, dtype="float32")),
     "salt": ("bumpy with fireflies", _changed(_salt)),
+    "relief": ("a height field with shadows and highlights", _relief),
     "negative": ("bumpy with zero-mean noise", _changed(_noise)),
 }
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from btfref import conventions
 from btfref.errors import InputError
 
 #: Ports by name. The definition, in float64, is what they are measured against.
-PORTS = ("drjit", "drjit without FastMath", "glsl")
+PORTS = ("numpy float32", "drjit", "drjit without FastMath", "glsl")
 
 
 def definition(representation, lookups):
@@ -38,9 +39,55 @@ def port(name, representation, path):
     """
     if name == "glsl":
         return _glsl(representation)
+    if name == "numpy float32":
+        return _single(representation)
     if name in ("drjit", "drjit without FastMath"):
         return _drjit(path, fast=name == "drjit")
     raise InputError("unknown evaluator", field="--evaluator", got=repr(name), expected=", ".join(PORTS))
+
+
+def count_malformed(name, representation, lookups):
+    """Malformed lookups as a port counts them.
+
+    Parameters
+    ----------
+    name : str
+        One of ``PORTS``.
+    representation : Representation
+    lookups : Lookups
+
+    Returns
+    -------
+    dict of str to int
+        As :func:`btfref.conventions.malformed`.
+    """
+    if name == "glsl":
+        from btfref.render.probe import probe_malformed
+
+        return probe_malformed(representation, *lookups.points)
+    if name == "numpy float32":
+        from btfref.numerics.precision import computing_in
+
+        with computing_in(np.float32):
+            return conventions.malformed(*lookups.points)
+    dr, mi = _mitsuba()
+    from mitsuba_plugins.lookup import malformed
+
+    uv, light, view = (np.ascontiguousarray(a.T) for a in lookups.points)
+    with dr.scoped_set_flag(dr.JitFlag.FastMath, name == "drjit"):
+        found = malformed(mi.Point2f(uv), mi.Vector3f(light), mi.Vector3f(view))
+        counts = [int(np.count_nonzero(np.array(mask))) for mask in found]
+    return dict(zip(("directions", "coordinates"), counts, strict=True))
+
+
+def _single(representation):
+    from btfref.numerics.precision import computing_in
+
+    def evaluate(lookups):
+        with computing_in(np.float32):
+            return definition(representation, lookups)
+
+    return evaluate
 
 
 def _glsl(representation):
@@ -49,7 +96,8 @@ def _glsl(representation):
     return lambda lookups: probe(representation, *lookups.points, lookups.lod)
 
 
-def _drjit(path, *, fast):
+def _mitsuba():
+    """Dr.Jit and Mitsuba in a variant of its compiler."""
     from btfref.platform import prepare_llvm
 
     prepare_llvm()
@@ -58,6 +106,11 @@ def _drjit(path, *, fast):
 
     if mi.variant() is None or mi.variant().startswith("scalar"):
         mi.set_variant("llvm_ad_rgb")
+    return dr, mi
+
+
+def _drjit(path, *, fast):
+    dr, mi = _mitsuba()
     import mitsuba_plugins
 
     mitsuba_plugins.register()

@@ -182,14 +182,12 @@ def continuous(method, representation, name, *, seed=0, blocks=1):
     )
 
 
-def energy(method, representation, btf, name):
-    """The mean over the tile and all pairs of directions, against the data's."""
+def energy(method, representation, btf, name, key="stress.energy.relative"):
+    """The mean over the tile and all pairs of directions, against the data's; ``key`` names the bound."""
     value, reference = _at_samples(representation, btf)
     mean = abs(reference.mean())
     worst = abs(value.mean() - reference.mean()) / mean if mean > 0 else abs(value.mean())
-    yield limit_finding(
-        "energy of the tile", method.key, name, worst, "stress.energy.relative", cases=SAMPLES
-    )
+    yield limit_finding("energy of the tile", method.key, name, worst, key, cases=SAMPLES)
 
 
 def overflow(method):

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from btfref.compare.tolerances import tolerance
+from btfref.conventions import malformed
 from btfref.errors import InputError
 from btfref.registry import method, methods
 from btfref.stress import properties
 from btfref.stress.data import DATA, make, scattered
-from btfref.stress.evaluators import PORTS, definition, port
+from btfref.stress.evaluators import PORTS, count_malformed, definition, port
 from btfref.stress.judging import Finding, judge_values, limit_finding, valid_lookups
 from btfref.stress.lookups import BLOCK, block
 
@@ -72,7 +73,7 @@ def run(*, only=None, data=None, evaluators=None, long=False, seed=0, progress=N
         for j, name in enumerate(names):
             report(i * (total // len(keys)) + j, total, f"{key}, {name}")
             # The definition always runs; ports that need a compiler only where the run is long or the data ask for it.
-            chosen = ports if long or data is not None or name in SHORT_DATA else ("glsl",)
+            chosen = ports if long or data is not None or name in SHORT_DATA else ("numpy float32", "glsl")
             some = [p for p in ports if p in chosen]
             findings += stress_data(key, name, some, seed=seed, long=long)
         if data is None:
@@ -147,6 +148,7 @@ def stress_lookups(representation, name, ports, *, seed=0, blocks=1, n=BLOCK):
             evaluate = port(evaluator, representation, path)
             values = [evaluate(lookups) for lookups in sets]
             yield _port_finding(representation, name, evaluator, sets, references, values, seed)
+            yield _count_finding(representation, name, evaluator, sets)
 
 
 def _definition_finding(representation, name, sets, references):
@@ -165,6 +167,19 @@ def _definition_finding(representation, name, sets, references):
     return limit_finding(
         "finite, 0 if invalid", key, name, bad, "stress.definition.wrong",
         cases=sum(len(s) for s in sets), where=where, detail=detail,
+    )  # fmt: skip
+
+
+def _count_finding(representation, name, evaluator, sets):
+    """Lookups that ask for what is none are counted alike by all evaluators; their values are exactly 0."""
+    expected = [malformed(*lookups.points) for lookups in sets]
+    found = [count_malformed(evaluator, representation, lookups) for lookups in sets]
+    off = sum(abs(a[kind] - b[kind]) for a, b in zip(expected, found, strict=True) for kind in a)
+    totals = {kind: sum(counts[kind] for counts in expected) for kind in expected[0]}
+    return limit_finding(
+        "malformed counted", representation.meta["method"], name, off, "stress.malformed.off",
+        evaluator=evaluator, cases=sum(len(s) for s in sets),
+        where=", ".join(f"{n} {kind}" for kind, n in totals.items()), detail=totals,
     )  # fmt: skip
 
 
@@ -239,6 +254,8 @@ def stress_fits(key):
         yield from properties.monotone(row, btf, name)
         yield from properties.symmetric(row, btf, name)
         yield from properties.energy(row, row.fit(btf), btf, name)
+    relief = make("relief")
+    yield from properties.energy(row, row.fit(relief), relief, "relief", "stress.energy.relief")
     yield from properties.overflow(row)
     with tempfile.TemporaryDirectory() as folder:
         yield from properties.refuses_nan(row, Path(folder))

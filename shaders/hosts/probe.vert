@@ -1,6 +1,7 @@
-// Provides one value of B for each vertex, through transform feedback: what the agreement tests compare.
+// Provides one value of B for each vertex, through transform feedback, and whether the lookup is malformed.
 // Expects a representation; attributes uv, w_light, w_view (local frame, unit length) and lod.
 
+#include "lib/malformed.glsl"
 #include "representation"
 
 in vec2 uv;
@@ -9,8 +10,10 @@ in vec3 w_view;
 in float lod;
 
 out vec3 value;
+out vec2 unusable;
 
 void main() {
     value = btf_eval(uv, w_light, w_view, lod);
+    unusable = malformed(uv, w_light, w_view);
     gl_Position = vec4(0.0, 0.0, 0.0, 1.0);
 }

@@ -12,9 +12,11 @@ from btfref import conventions
 from btfref.cli import main
 from btfref.compare.tolerances import tolerance
 from btfref.numerics.directions import directions
+from btfref.numerics.precision import computing_in
 from btfref.registry import method, methods
 from btfref.stress import properties, runner
 from btfref.stress.data import DATA, make, scattered
+from btfref.stress.evaluators import PORTS
 from btfref.stress.judging import judge_values
 from btfref.stress.lookups import COORDINATES, DIRECTIONS, block
 from btfref.stress.table import check_table, evaluator_table, failure_lines
@@ -73,6 +75,18 @@ def test_the_long_run(key, llvm, need):
 @pytest.mark.parametrize("key", ["lpca", "laplacian", "cmf"])
 def test_values_are_continuous(key, fits):
     assert_all_pass(properties.continuous(method(key), fits(key), "formula"))
+
+
+@pytest.mark.long
+def test_what_the_limits_of_the_g_brdf_are_for(llvm):
+    """Converged, it scales as the others do; on data of a height field it keeps the energy that the others keep."""
+    bumpy, relief, row = make("bumpy"), make("relief"), method("gbrdf")
+    scaled = properties._with(bumpy, bumpy.values.astype(np.float32) * np.float32(0.25))
+    bright, dark = (properties.sample_error(row.fit(b, iterations=32), b) for b in (bumpy, scaled))
+    assert dark <= tolerance("stress.scaling.ratio") * bright
+    (finding,) = properties.energy(row, row.fit(relief), relief, "relief", "stress.energy.relief")
+    assert finding.passed
+    assert finding.bound == tolerance("stress.energy.relative")
 
 
 def test_jumps_are_found(fits):
@@ -156,6 +170,37 @@ def test_malformed_lookups_are_counted(fits):
     uv = np.array([[0.1, 0.2], [0, 0], [np.inf, 0], [0, np.nan], [0, 0]])
     assert conventions.malformed(uv, lights, views) == {"directions": 3, "coordinates": 2}
     np.testing.assert_array_equal(fits("raw").evaluate(uv, lights, views)[1:], 0)
+
+
+def test_every_port_counts_malformed_lookups(fits, llvm, need, monkeypatch):
+    need("gl")
+    findings = list(runner.stress_lookups(fits("raw"), "formula", PORTS, n=1024))
+    counted = [f for f in findings if f.check == "malformed counted"]
+    assert [f.evaluator for f in counted] == list(PORTS)
+    assert all(f.passed and f.detail["directions"] > 50 and f.detail["coordinates"] > 50 for f in counted)
+    wrong = {"directions": 1, "coordinates": 1}
+    monkeypatch.setattr(runner, "count_malformed", lambda *_: wrong)
+    assert not [
+        f
+        for f in runner.stress_lookups(fits("raw"), "formula", PORTS[:1], n=1024)
+        if f.check == "malformed counted" and f.passed
+    ]
+
+
+@pytest.mark.parametrize("key", methods())
+def test_the_definition_in_single_precision(key, fits):
+    """It computes in float32 all through, meets its bound, and leaves float64 as it was."""
+    representation = fits(key)
+    lookups = block(representation, 0, 0, 512)
+    before = representation.evaluate(*lookups.points, lod=lookups.lod)
+    with computing_in(np.float32):
+        single = representation.evaluate(*lookups.points, lod=lookups.lod)
+    after = representation.evaluate(*lookups.points, lod=lookups.lod)
+    assert single.dtype == np.float32
+    assert before.dtype == np.float64
+    np.testing.assert_array_equal(before, after)
+    assert not np.array_equal(single, before.astype(np.float32))
+    assert_all_pass(runner.stress_lookups(representation, "formula", ("numpy float32",), n=2048))
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
