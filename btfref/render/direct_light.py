@@ -9,8 +9,14 @@ from btfref.render.camera import film_rays, grid_offsets
 #: Camera rays times samples that are traced at a time.
 LANES = 1 << 22
 
-#: Independent rounds a sub-pixel position at least: their spread is the variance.
+#: Independent rounds a sub-pixel position: their spread is the variance.
 ROUNDS = 4
+
+#: Increments of additive recurrences in two and three dimensions, powers of the inverse of the root of
+#: x^(d + 1) = x + 1 (M. Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018), in units of 2^-32.
+STEPS = tuple(
+    round(2**32 * root**-k) for root, d in ((1.324717957, 2), (1.220744085, 3)) for k in range(1, d + 1)
+)
 
 
 def make_integrator(shadows):
@@ -27,12 +33,7 @@ def make_integrator(shadows):
     -------
     mitsuba.SamplingIntegrator
     """
-    import drjit as dr
     import mitsuba as mi
-
-    def heuristic(a, b):
-        a, b = a * a, b * b
-        return dr.select(a > 0, a / (a + b), 0)
 
     class DirectLight(mi.SamplingIntegrator):
         def __init__(self, props):
@@ -41,28 +42,12 @@ def make_integrator(shadows):
         def sample(self, scene, sampler, ray, medium=None, active=True):
             si = scene.ray_intersect(mi.Ray3f(ray), active)
             active = mi.Bool(active) & si.is_valid()
-            bsdf, context = si.bsdf(mi.RayDifferential3f(ray)), mi.BSDFContext()
-            light, weight = scene.sample_emitter_direction(si, sampler.next_2d(active), shadows, active)
-            lit = active & (light.pdf > 0)
-            value, pdf = bsdf.eval_pdf(context, si, si.to_local(light.d), lit)
-            share = dr.select(light.delta, 1, heuristic(light.pdf, pdf))
-            result = dr.select(lit, weight * value * share, 0)
-            environment = scene.environment()
-            if environment is not None:
-                sampled, weight = bsdf.sample(
-                    context, si, sampler.next_1d(active), sampler.next_2d(active), active
-                )
-                going = active & (sampled.pdf > 0)
-                light = dr.zeros(mi.DirectionSample3f)
-                light.d, light.emitter = si.to_world(sampled.wo), mi.EmitterPtr(environment)
-                if shadows:
-                    going &= ~scene.ray_test(si.spawn_ray(light.d), going)
-                sky = dr.zeros(mi.SurfaceInteraction3f)
-                sky.wi = -light.d
-                pdf = scene.pdf_emitter_direction(si, light, going)
-                radiance = environment.eval(sky, going)
-                result += dr.select(going, weight * radiance * heuristic(sampled.pdf, pdf), 0)
-            return result, active, []
+            numbers = sampler.next_2d(active), sampler.next_1d(active), sampler.next_2d(active)
+            return (
+                _direct(scene, si, si.bsdf(mi.RayDifferential3f(ray)), *numbers, shadows, active),
+                active,
+                [],
+            )
 
         def to_string(self):
             return f"DirectLight[shadows={shadows}]"
@@ -70,12 +55,43 @@ def make_integrator(shadows):
     return DirectLight(mi.Properties())
 
 
+def _direct(scene, si, bsdf, of_light, lobe, of_bsdf, shadows, active):
+    """Radiance at surface interactions from uniform numbers: two for the emitters, one and two for the material."""
+    import drjit as dr
+    import mitsuba as mi
+
+    def heuristic(a, b):
+        a, b = a * a, b * b
+        return dr.select(a > 0, a / (a + b), 0)
+
+    context = mi.BSDFContext()
+    light, weight = scene.sample_emitter_direction(si, of_light, shadows, active)
+    lit = active & (light.pdf > 0)
+    value, pdf = bsdf.eval_pdf(context, si, si.to_local(light.d), lit)
+    share = dr.select(light.delta, 1, heuristic(light.pdf, pdf))
+    result = dr.select(lit, weight * value * share, 0)
+    environment = scene.environment()
+    if environment is not None:
+        sampled, weight = bsdf.sample(context, si, lobe, of_bsdf, active)
+        going = active & (sampled.pdf > 0)
+        light = dr.zeros(mi.DirectionSample3f)
+        light.d, light.emitter = si.to_world(sampled.wo), mi.EmitterPtr(environment)
+        if shadows:
+            going &= ~scene.ray_test(si.spawn_ray(light.d), going)
+        sky = dr.zeros(mi.SurfaceInteraction3f)
+        sky.wi = -light.d
+        pdf = scene.pdf_emitter_direction(si, light, going)
+        radiance = environment.eval(sky, going)
+        result += dr.select(going, weight * radiance * heuristic(sampled.pdf, pdf), 0)
+    return result
+
+
 def regular(scene, grid, spp, seed, shadows):
     """Direct light at n × n regular sub-pixel positions: random are the light's directions alone.
 
     Against a renderer that has the same positions no difference of texture sampling is left. The samples of a round
-    are correlated multi-jittered (Kensler 2013, Pixar technical memo 13-01), which takes a fifth to a fifteenth of
-    their number under environments; rounds are independent.
+    are a lattice that is shifted at random, for each pixel anew (Cranley, Patterson 1976), which takes a fifth to a
+    twentieth of their number under environments; rounds are independent.
 
     Parameters
     ----------
@@ -83,49 +99,68 @@ def regular(scene, grid, spp, seed, shadows):
     grid : int
         n.
     spp : int
-        Samples a pixel, at least two a position; rounded up to the same number for all positions.
+        Samples a pixel, at least four a position; rounded up to the same number for all positions.
     seed : int
     shadows : bool
 
     Returns
     -------
-    image, variance : ndarray of float32, shape (H, W, 3)
-        The variance is that of the mean.
+    batches : ndarray of float32, shape (4, H, W, 3)
+        Independent pictures; their mean is the result.
+    variance : ndarray of float32, shape (H, W, 3)
+        That of the mean, from the spread at each position.
     spp : int
         Taken.
     """
     import drjit as dr
     import mitsuba as mi
 
-    integrator, sensor = make_integrator(shadows), scene.sensors()[0]
+    sensor = scene.sensors()[0]
     width, height = (int(n) for n in sensor.film().crop_size())
     pixels = width * height
-    each = max(2, -(-spp // grid**2))
-    # A square grid of strata.
-    step = int(max(1, min(each // min(each, ROUNDS), LANES // pixels)) ** 0.5) ** 2
-    rounds = -(-each // step)
-    sampler = mi.load_dict({"type": "multijitter", "sample_count": step})
-    sampler.set_samples_per_wavefront(step)
-    seeds = iter(np.random.SeedSequence(seed).generate_state(rounds * grid**2))
-    mean, variance = np.zeros((2, 3, pixels))
+    each = -(-spp // grid**2)
+    step = max(1, min(-(-each // ROUNDS), LANES // pixels))
+    rounds = ROUNDS * -(-each // (ROUNDS * step))
+    # Data, not code: one kernel for all numbers of samples.
+    n = dr.opaque(mi.UInt32, step)
+    rng = np.random.default_rng(seed)
+    batches, variance = np.zeros((ROUNDS, 3, pixels)), np.zeros((3, pixels))
     for offset in grid_offsets(grid):
-        average, squares = np.zeros((2, 3, pixels))
         ray, _ = film_rays(sensor, offset)
-        index = dr.arange(mi.UInt32, pixels * step) // step
-        rays = mi.Ray3f(dr.gather(mi.Point3f, ray.o, index), dr.gather(mi.Vector3f, ray.d, index))
-        rays.maxt = dr.gather(mi.Float, ray.maxt, index)
+        si = scene.ray_intersect(ray)
+        hit = dr.compress(si.is_valid())
+        if not dr.width(hit):
+            continue
+        si, at = dr.gather(mi.SurfaceInteraction3f, si, hit), np.array(hit)
+        dr.eval(si)
+        values = np.zeros((rounds, 3, len(at)))
         for done in range(rounds):
-            sampler.seed(int(next(seeds)), pixels * step)
-            value, _, _ = integrator.sample(scene, sampler, rays, None, mi.Bool(True))
+            lane = dr.arange(mi.UInt32, len(at) * step)
+            index = lane // n
+            shifts = rng.integers(2**32, size=(len(STEPS), len(at)), dtype=np.uint32)
+            numbers = [
+                mi.Float(
+                    (dr.gather(mi.UInt32, mi.UInt32(shift), index) + (lane - index * n) * increment) >> 8
+                )
+                * 2**-24
+                for shift, increment in zip(shifts, STEPS, strict=True)
+            ]
+            place = dr.gather(mi.SurfaceInteraction3f, si, index)
+            value = _direct(
+                scene,
+                place,
+                place.bsdf(),
+                mi.Point2f(numbers[:2]),
+                numbers[2],
+                mi.Point2f(numbers[3:]),
+                shadows,
+                mi.Bool(True),
+            )
             sums = [dr.block_sum(v, step) for v in value]
             dr.eval(sums)
-            # Welford: rounds differ by little, sums of squares would lose it.
-            found = np.array([np.array(s) for s in sums], float) / step
-            change = found - average
-            average += change / (done + 1)
-            squares += change * (found - average)
-        mean += average / grid**2
-        variance += squares / (rounds - 1) / rounds / grid**4
-    shape = height, width, 3
-    images = (a.T.reshape(shape).astype(np.float32) for a in (mean, variance))
-    return *images, rounds * step * grid**2
+            values[done] = np.array([np.array(s) for s in sums], float) / step
+        batches[..., at] += values.reshape(-1, ROUNDS, 3, len(at)).mean(0) / grid**2
+        variance[:, at] += values.var(0, ddof=1) / rounds / grid**4
+    pictures = batches.reshape(ROUNDS, 3, height, width).transpose(0, 2, 3, 1).astype(np.float32)
+    variance = variance.T.reshape(height, width, 3).astype(np.float32)
+    return pictures, variance, rounds * step * grid**2

@@ -60,7 +60,8 @@ def render(
         Estimate the variance of the mean from independent renders of ``spp / 16`` samples each.
     grid : int, optional
         Direct light only, at n × n regular sub-pixel positions as ``noise_free``, but with random directions of the
-        light, so that environments are possible; always with a variance.
+        light, so that environments are possible; always with a variance, and with ``meta["batches"]``, four
+        independent pictures, float32 (4, H, W, 3).
     maps : {"all", "needed"}
         "needed" loads the maps of those views alone that the cameras' first hits need, and without noise those of the
         lights as well, of methods that keep maps by direction: the same picture bit by bit. ``meta["maps"]`` says how
@@ -141,8 +142,10 @@ def traced(made, *, spp=None, seed=0, noise_free=None, shadows=True, with_varian
     elif grid is not None:
         from btfref.render.direct_light import regular
 
-        image, variance, spp = regular(made, grid, spp, seed, shadows)
+        batches, variance, spp = regular(made, grid, spp, seed, shadows)
+        image = batches.mean(0)
         settings = {"grid": grid, "spp": spp, "seed": seed, "shadows": shadows, "integrator": "direct"}
+        settings["batches"] = batches
     else:
         image, variance, settings = _monte_carlo(made, spp, seed, with_variance, shadows)
     facts = {
