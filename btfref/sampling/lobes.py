@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-#: Entries of the table of a.
-N_TABLE = 33
+#: Entries of the table of a: those of Mitsuba's rough plastic, so that its lobe is the table's to the last bits.
+N_TABLE = 64
+
+#: Deviation of a diffuse lobe from the table, relative to its largest value, below which nothing tells them apart.
+EXACT = 1e-5
 
 #: Largest deviation of a diffuse lobe from the product, relative to its largest value, to be taken as it is.
 SEPARABLE = 2e-3
@@ -29,6 +32,10 @@ class BroadLobes:
         Whether every BSDF can sample and evaluate the rest by itself (it honours Mitsuba's type mask).
     any : bool
         Whether there is any broad lobe.
+    exact : bool
+        Whether every broad lobe is the table's, and the rest evaluates by itself.
+    drawn : mitsuba.BSDFContext
+        Lobes that the rest is sampled by.
     """
 
     def __init__(self, bsdfs):
@@ -38,6 +45,7 @@ class BroadLobes:
         self.ids = [int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]) for bsdf in bsdfs]
         size = max(self.ids) + 1
         tables, kind = np.ones((size, N_TABLE)), np.zeros(size)
+        exact = True
         diffuse = int(mi.BSDFFlags.DiffuseReflection)
         everything = int(mi.BSDFContext().type_mask)
         self.full, self.diffuse, self.rest = (mi.BSDFContext() for _ in range(3))
@@ -46,7 +54,8 @@ class BroadLobes:
         for index, bsdf in zip(self.ids, bsdfs, strict=True):
             if not mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection):
                 continue
-            table = self._separated(bsdf)
+            table, deviation = self._separated(bsdf)
+            exact &= deviation <= EXACT
             kind[index] = 1 if table is None else 2
             if table is not None:
                 tables[index] = table
@@ -54,11 +63,13 @@ class BroadLobes:
         # Without a broad lobe everything is the rest, whatever the mask.
         self.masked = bool((used != 1).all() and (used == 2).any())
         self.any = bool((used > 0).any())
+        self.exact = self.masked and exact
+        self.drawn = self.rest if self.masked else self.full
         self._kind, self._table = mi.Float(kind), mi.Float(tables.ravel())
         self.table = tables
 
     def _separated(self, bsdf):
-        """The table of a when the BSDF keeps its diffuse lobe apart and that lobe separates; else None."""
+        """The table of a when the BSDF keeps its diffuse lobe apart and that lobe separates, else None; deviation."""
         import drjit as dr
         import mitsuba as mi
 
@@ -78,19 +89,24 @@ class BroadLobes:
         parts = value(self.diffuse, wi, wo) + value(self.rest, wi, wo)
         full = value(self.full, wi, wo)
         if np.abs(parts - full).max() > SEPARABLE * np.abs(full).max():
-            return None
+            return None, np.inf
         normal = np.tile([0.0, 0.0, 1.0], (N_TABLE, 1))
         slanted = np.stack([np.sqrt(1 - z**2), np.zeros_like(z), z], 1)
         along = value(self.diffuse, slanted, normal)
         if along[-1].max() <= 0:
-            return None
+            return None, np.inf
         table = along.sum(1) / along[-1].sum()
+        # The first was taken off the horizon.
+        t = z[0] * (N_TABLE - 1)
+        table[0] = (table[0] - t * table[1]) / (1 - t)
+        z[0] = 0
         model = np.interp(wi[:, 2], z, table) * np.interp(wo[:, 2], z, table) * wo[:, 2]
         # Elsewhere on a texture the lobe may be of another colour, not of another shape.
         uv, up = rng.random((2, len(wi))), np.tile([0.0, 0.0, 1.0], (len(wi), 1))
         model = model[:, None] * value(self.diffuse, up, up, uv)
         measured = value(self.diffuse, wi, wo, uv)
-        return None if np.abs(model - measured).max() > SEPARABLE * measured.max() else table
+        deviation = np.abs(model - measured).max() / measured.max()
+        return (None, np.inf) if deviation > SEPARABLE else (table, deviation)
 
     def albedo(self, bsdf, index, si, active=True):
         """ρ at surface points; 0 where the BSDF has no broad lobe.
@@ -143,10 +159,8 @@ class BroadLobes:
         """Sample the rest: (BSDFSample3f, weight = rest · cosine / pdf)."""
         import drjit as dr
 
-        if self.masked:
-            return bsdf.sample(self.rest, si, lobe, uv, active)
-        sample, weight = bsdf.sample(self.full, si, lobe, uv, active)
-        if self.any:
+        sample, weight = bsdf.sample(self.drawn, si, lobe, uv, active)
+        if self.any and not self.masked:
             import mitsuba as mi
 
             smooth = active & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta) & (sample.pdf > 0)
@@ -155,7 +169,9 @@ class BroadLobes:
 
     def eval_rest(self, bsdf, index, albedo, si, wo, active):
         """The rest times cosine of ``wo``."""
-        if self.masked:
-            return bsdf.eval(self.rest, si, wo, active)
-        value = bsdf.eval(self.full, si, wo, active)
-        return value - self.value(index, albedo, si.wi, wo) if self.any else value
+        value = bsdf.eval(self.drawn, si, wo, active)
+        return value - self.value(index, albedo, si.wi, wo) if self.any and not self.masked else value
+
+    def pdf_rest(self, bsdf, si, wo, active):
+        """Density (per solid angle) of `sample_rest`."""
+        return bsdf.pdf(self.drawn, si, wo, active)

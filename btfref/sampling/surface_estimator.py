@@ -29,15 +29,16 @@ from typing import Any
 
 import numpy as np
 
-from btfref.numerics.transfer import to_device
+from btfref.numerics.transfer import in_one_kernel, to_device
 from btfref.sampling.lobes import BroadLobes
 from btfref.sampling.surface_cache import LARGEST, LEAST, VisibilityCache
 from btfref.sampling.surface_gather import gather
+from btfref.sampling.surface_pilot import contrast
 from btfref.sampling.surface_points import Bins, centroids, footprints, sample_points
 from btfref.sampling.surface_texels import TexelWalks, lanes
 from btfref.sampling.surface_triangles import density, triangles
 from btfref.sampling.surface_walks import Lights, Surface, continue_walks, visibility
-from btfref.sampling.tiled_scene import START, TiledScene, stream_keys, uniforms
+from btfref.sampling.tiled_scene import START, TiledScene, rotated, stream_keys, uniforms
 
 #: View rays of a half whose other half finds a texel empty.
 RAYS = 2
@@ -52,7 +53,7 @@ BACK_DIRECTIONS = 8
 GATHER_BUFFER = 96 << 20
 
 # Streams of random numbers.
-_POINTS, _RAYS, _BROAD = range(3)
+_POINTS, _RAYS, _BROAD, _REST, _PLACES = range(5)
 
 
 @dataclass
@@ -113,6 +114,8 @@ class SurfaceEstimator:
         Views that will be asked for; None for all.
     mask : ndarray (rows · columns,) bool, optional
         Texels that are asked for; None for all. The others lack light by way of broad lobes.
+    variance : bool
+        Whether variances are made; they take about a third of the time of `all_views`.
 
     Notes
     -----
@@ -121,11 +124,14 @@ class SurfaceEstimator:
 
     key = "surface"
 
-    def __init__(self, mesostructure, lights, *, views, texels, spp, seed, max_depth, wanted=None, mask=None):
+    def __init__(
+        self, mesostructure, lights, *, views, texels, spp, seed, max_depth, wanted=None, mask=None,
+        variance=True,
+    ):  # fmt: skip
         import mitsuba as mi
 
         self.texels, self.spp, self.seed = tuple(texels), int(spp), int(seed)
-        self.mask = mask
+        self.mask, self.variance = mask, variance
         self.n_texels = texels[0] * texels[1]
         views, lights = np.asarray(views, np.float64), np.asarray(lights, np.float64)
         wanted = np.arange(len(views)) if wanted is None else np.asarray(wanted)
@@ -152,7 +158,7 @@ class SurfaceEstimator:
         if self.n_vertices >= 2:
             self.walks = TexelWalks(
                 self.scene, self.surface, self.bins, per_half=self.rest_walks,
-                n_texels=self.n_texels, n_vertices=self.n_vertices, seed=self.seed,
+                n_texels=self.n_texels, n_vertices=self.n_vertices, seed=self.seed, stream=_REST,
             )  # fmt: skip
             self._walk_from_points()
 
@@ -166,7 +172,8 @@ class SurfaceEstimator:
         n_triangles = len(pieces.area)
         up = views[views[:, 2] > 0]
         pilots = up[:: max(1, -(-len(up) * n_triangles // PILOT_RAYS))]
-        surface = Surface.of_points(centroids(pieces), scene.lobes)
+        middles = centroids(pieces)
+        surface = Surface.of_points(middles, scene.lobes)
         few = pilots[:: max(1, len(pilots) // BACK_DIRECTIONS)]
         back = visibility(scene.tiles, surface, few).astype(bool) & ((few @ pieces.facet.T) < 0)
         #: Closed surfaces never show their back: half of the rays need not be traced.
@@ -176,7 +183,8 @@ class SurfaceEstimator:
             bits = visibility(scene.tiles, surface, scene.directions, front_only=self.closed)
         front = visibility(scene.tiles, surface, pilots, front_only=True).astype(bool)
         scene.cache = VisibilityCache(bits, descent, scene.lobes, scene.directions)
-        share = density(pieces, pilots, front)
+        varied = contrast(surface, middles, scene.lobes, pilots, front, self.texels)
+        share = density(pieces, pilots, front, varied)
         self.points = sample_points(pieces, share, count, np.random.default_rng([self.seed, _POINTS]))
 
     def _see(self):
@@ -250,27 +258,47 @@ class SurfaceEstimator:
     def _light_table(self, seen, sights):
         """Per record and light: three sums of light by way of the broad lobe, and the visibility.
 
-        ``seen`` [light, point] tells that of points, ``sights`` [ray, direction] that of view rays.
+        ``seen`` [light, point] tells that of points, ``sights`` [ray, direction] that of view rays. Direct light
+        by way of broad lobes is among the sums where these are the tables'; `gather` adds the rest alone.
         """
         import drjit as dr
         import mitsuba as mi
 
-        n_points, n_lit, cache = seen.shape[1], len(self.lit), self.scene.cache
+        n_points, n_lit, cache, lobes = seen.shape[1], len(self.lit), self.scene.cache, self.scene.lobes
         self.table = dr.zeros(mi.Float, len(self.stream) * n_lit * 4)
+
+        def fill(lane, record, sees):
+            light = lane % n_lit
+            if lobes.exact:
+                _, _, number, albedo = self.surface.interaction(record)
+                w = dr.gather(mi.Vector3f, self.scene.lights.vectors, light)
+                cosine = dr.dot(dr.gather(mi.Vector3f, self.surface.shading, record), w)
+                direct = albedo * (lobes.shape(number, cosine) * dr.maximum(cosine, 0) * dr.inv_pi * sees)
+            else:
+                direct = mi.Color3f(0)
+            values = (*direct, sees)
+
+            def write():
+                for k, value in enumerate(values):
+                    dr.scatter(self.table, value, (record * n_lit + light) * 4 + k)
+
+            in_one_kernel(dr.width(lane), write)
+
         lane = dr.arange(mi.UInt32, n_points * n_lit)
         sees = dr.gather(mi.UInt8, to_device(mi.UInt8, seen), lane % n_lit * n_points + lane // n_lit)
-        dr.scatter(self.table, mi.Float(sees), lane * 4 + 3)
+        fill(lane, lane // n_lit, mi.Float(sees))
         if sights is not None:
             lane = dr.arange(mi.UInt32, (len(self.stream) - n_points) * n_lit)
             row = dr.gather(mi.UInt32, self.scene.lights.rows, lane % n_lit)
             sees = cache.value(dr.gather(mi.UInt8, sights, lane // n_lit * cache.n + row))
-            dr.scatter(self.table, sees, (lane + n_points * n_lit) * 4 + 3)
+            fill(lane, lane // n_lit + n_points, sees)
         dr.eval(self.table)
 
     # --- walks
 
     def _walk_from_points(self):
         """Light by way of the broad lobe at the points: cosine-distributed walks, the same for all views."""
+        import drjit as dr
         import mitsuba as mi
 
         scene = self.scene
@@ -281,10 +309,13 @@ class SurfaceEstimator:
         start = np.flatnonzero(self.used & (albedo.max(1) > 0))
         if not len(start):
             return
+        places = stream_keys(self.seed, _PLACES)
         for k in range(self.broad_walks):
             index, lane = (to_device(mi.UInt32, words) for words in (start, self.stream[start]))
             keys = stream_keys(self.seed, _BROAD, k)
-            u, v, _, _ = uniforms(lane, keys, mi.UInt32(0))
+            # The walks of a point share a random place in the square, from where they fill it evenly.
+            u, v, _, _ = uniforms(lane, places, mi.UInt32(0))
+            u, v = rotated(u, v, dr.opaque(mi.UInt32, k))
             si, _, number, rho = self.surface.interaction(index)
             local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(u, v))
             weight = rho * lobes.shape(number, local.z)
@@ -313,7 +344,8 @@ class SurfaceEstimator:
         Yields
         ------
         view, mean, variance : int, ndarray, ndarray
-            Mean and variance of shape (n_lights, rows, columns, 3), float32.
+            Mean and variance of shape (n_lights, rows, columns, 3), float32; None for a variance that is not
+            made.
         """
         views = list(views)
         each = self.n_texels * max(len(self.lit), 1) * 12
@@ -323,13 +355,14 @@ class SurfaceEstimator:
         for view in views:
             if view not in self.row or not len(self.lit):
                 zero = np.zeros((self.n_lights, *self.texels, 3), np.float32)
-                yield view, zero, zero.copy()
+                yield view, zero, zero.copy() if self.variance else None
                 continue
             if view not in held:
                 now = live[done : done + together]
-                held = dict(zip(now, zip(*self._results(now), strict=True), strict=True))
+                mean, variance = self._results(now)
+                held = {one: (mean[k], None if variance is None else variance[k]) for k, one in enumerate(now)}
             done += 1
-            yield view, *map(self._all_lights, held[view])
+            yield view, *(None if part is None else self._all_lights(part) for part in held[view])
 
     def _results(self, views):
         """Means and variances of several views: (views, lights above the horizon, texels, 3) each."""
@@ -338,8 +371,8 @@ class SurfaceEstimator:
         return gather(
             self.scene, self.surface, self.table, rows, [self.bins[k] for k in rows],
             radiance=None if walks is None else walks.radiance(rows),
-            splats=None if walks is None or not self.scene.lobes.any else walks.splatted(rows, self.texels),
-            texels=self.texels,
+            splats=None if walks is None else walks.splatted(rows, self.texels, self.variance),
+            texels=self.texels, variance=self.variance,
         )  # fmt: skip
 
     def _all_lights(self, part):

@@ -20,7 +20,7 @@ LIGHTS_PER_LANE = 3
 LEAST_FREEDOM = 4
 
 
-def gather(scene, surface, table, rows, bins, *, radiance, splats, texels):
+def gather(scene, surface, table, rows, bins, *, radiance, splats, texels, variance=True):
     """Means and variances of the mean of several views.
 
     Parameters
@@ -35,13 +35,16 @@ def gather(scene, surface, table, rows, bins, *, radiance, splats, texels):
         One per view.
     radiance : mitsuba.Float
         Light by way of the rest, [view, half, texel, light, 3].
-    splats : tuple of mitsuba.Float, or None
-        Sums and sums of squares of photons, [view, light, texel, 3].
+    splats : list of mitsuba.Float, or None
+        Sums of photons, and with a variance sums of their squares, [view, light, texel, 3]; they are added to.
     texels : tuple of int
+    variance : bool
+        Whether variances are made.
 
     Returns
     -------
     mean, variance : ndarray (views, lights, texels, 3) float32
+        None for a variance that is not wanted.
 
     Notes
     -----
@@ -55,18 +58,17 @@ def gather(scene, surface, table, rows, bins, *, radiance, splats, texels):
 
     n_texels, n_lit = texels[0] * texels[1], scene.lights.count
     shape = (len(rows), n_lit, n_texels, 3)
-    points, spread = _points(scene, surface, table, rows, bins, n_texels)
+    points, spread = _points(scene, surface, table, rows, bins, n_texels, variance)
     n_blocks = -(-n_lit // LIGHTS_PER_LANE)
-    halves = np.stack([some.totals() for some in bins])  # view, half, texel
-    lean = 0.5 * (halves[:, 0] - halves[:, 1])
-    share = to_device(mi.Float, 0.5 + lean)
+    halves = np.stack([some.totals for some in bins])  # view, half, texel
+    share = to_device(mi.Float, 0.5 + 0.5 * (halves[:, 0] - halves[:, 1]))
 
     lane = dr.arange(mi.UInt32, len(rows) * n_texels * n_blocks)
     cell, first = lane // n_blocks, (lane % n_blocks) * LIGHTS_PER_LANE
     view, texel = cell // n_texels, cell % n_texels
-    mean, variance = (dr.zeros(mi.Float, int(np.prod(shape))) for _ in range(2))
+    drafts = [dr.empty(mi.Float, int(np.prod(shape))) for _ in range(1 + variance)]
     mine = dr.gather(mi.Float, share, cell)
-    if radiance is not None:
+    if variance and radiance is not None:
         pooled = _pooled(radiance, len(rows), texels, n_lit)
         block = (texel // texels[1] // 2) * ((texels[1] + 1) // 2) + texel % texels[1] // 2
         block += view * (((texels[0] + 1) // 2) * ((texels[1] + 1) // 2))
@@ -75,27 +77,52 @@ def gather(scene, surface, table, rows, bins, *, radiance, splats, texels):
         for j in range(LIGHTS_PER_LANE):
             light = first + j
             inside = light < n_lit
-            value, noise = points[j], spread[j]
+            results = [points[j], *([spread[j]] if variance else [])]
             if radiance is not None:
                 at = (2 * view * n_texels + texel) * n_lit + light
                 one = dr.gather(mi.Color3f, radiance, at, inside)
                 other = dr.gather(mi.Color3f, radiance, at + n_texels * n_lit, inside)
-                value += mine * one + (1 - mine) * other
-                # The halves' shares are mine and 1 − mine, the pooled number is for ½ and ½.
-                scale = 2 * (dr.square(mine) + dr.square(1 - mine))
-                noise += scale * dr.gather(mi.Color3f, pooled, block * n_lit + light, inside)
-            if splats is not None:
-                at = (view * n_lit + light) * n_texels + texel
-                value += dr.gather(mi.Color3f, splats[0], at, inside)
-                noise += dr.gather(mi.Color3f, splats[1], at, inside)
-            at = ((view * n_lit + light) * n_texels + texel) * 3
-            for channel in range(3):
-                dr.scatter(mean, value[channel], at + channel, inside)
-                dr.scatter(variance, noise[channel], at + channel, inside)
+                results[0] += mine * one + (1 - mine) * other
+                if variance:
+                    # The halves' shares are mine and 1 − mine, the pooled number is for ½ and ½.
+                    scale = 2 * (dr.square(mine) + dr.square(1 - mine))
+                    results[1] += scale * dr.gather(mi.Color3f, pooled, block * n_lit + light, inside)
+            at = (cell * n_lit + light) * 3
+            for draft, result in zip(drafts, results, strict=True):
+                for channel in range(3):
+                    dr.scatter(draft, result[channel], at + channel, inside)
 
     in_one_kernel(dr.width(lane), write)
-    dr.eval(mean, variance)
-    return mean.numpy().reshape(shape), variance.numpy().reshape(shape)
+    dr.eval(drafts)
+    made = [
+        _turned(draft, shape, None if splats is None else splats[k]).numpy().reshape(shape)
+        for k, draft in enumerate(drafts)
+    ]
+    return made[0], made[1] if variance else None
+
+
+def _turned(draft, shape, target):
+    """From [view, texel, light, 3], as lanes make them, to [view, light, texel, 3], added to a target if any."""
+    import drjit as dr
+    import mitsuba as mi
+
+    _, n_lit, n_texels, _ = shape
+    # Texels of a light next to each other: a line of the draft is still in the cache for the next lights.
+    lane = dr.arange(mi.UInt32, dr.width(draft) // 3)
+    texel, rest = lane % n_texels, lane // n_texels
+    value = dr.gather(mi.Color3f, draft, (rest // n_lit * n_texels + texel) * n_lit + rest % n_lit)
+    if target is None:
+        target = dr.empty(mi.Float, dr.width(draft))
+    else:
+        value += dr.gather(mi.Color3f, target, lane)
+
+    def write():
+        for channel in range(3):
+            dr.scatter(target, value[channel], 3 * lane + channel)
+
+    in_one_kernel(dr.width(lane), write)
+    dr.eval(target)
+    return target
 
 
 def _pooled(radiance, n_views, texels, n_lit):
@@ -138,14 +165,12 @@ def _packets(scene, surface, rows, bins):
     shading, s = (dr.gather(mi.Vector3f, a, record) for a in (surface.shading, surface.s))
     wi = mi.Frame3f(s, dr.cross(shading, s), mi.Normal3f(shading)).to_local(w)
     uv = dr.gather(mi.Point2f, surface.uv, record)
-    weight, half = (np.concatenate([getattr(some, name) for some in bins]) for name in ("weight", "half"))
+    weight, part = (np.concatenate([getattr(some, name) for some in bins]) for name in ("weight", "part"))
     lane = dr.arange(mi.UInt32, len(weight))
-    packets = dr.zeros(mi.Float, 16 * len(weight))
+    packets = dr.empty(mi.Float, 16 * len(weight))
     numbers, records = (mi.Float(dr.reinterpret_array(mi.Float, a)) for a in (number, record))
-    values = (
-        *s, uv.x, *shading, uv.y, *wi, scene.lobes.shape(number, wi.z),
-        to_device(mi.Float, weight), numbers, records, to_device(mi.Float, half),
-    )  # fmt: skip
+    weight, part = to_device(mi.Float, weight), to_device(mi.Float, part)
+    values = (*s, uv.x, *shading, uv.y, *wi, scene.lobes.shape(number, wi.z), part, numbers, records, weight)
 
     def write():
         for k, value in enumerate(values):
@@ -156,7 +181,7 @@ def _packets(scene, surface, rows, bins):
     return packets
 
 
-def _points(scene, surface, table, rows, bins, n_texels):
+def _points(scene, surface, table, rows, bins, n_texels, variance):
     """Mean and its variance from the entries: per light of a lane's block one colour each."""
     import drjit as dr
     import mitsuba as mi
@@ -176,8 +201,10 @@ def _points(scene, surface, table, rows, bins, n_texels):
     index = [dr.minimum(first + j, n_lit - 1) for j in range(block)]
     vectors = [dr.gather(mi.Vector3f, lights.vectors, i) for i in index]
     light_count = dr.opaque(mi.UInt32, n_lit)
+    # Direct light by way of broad lobes is in the table where they are the table's.
+    context = lobes.drawn if lobes.exact else lobes.full
 
-    def step(entry, weights, squares, last_w, last_pair, last, dd, dx, dw, sums):
+    def entry_values(entry):
         e = [dr.gather(mi.Array4f, packets, entry * 4 + k) for k in range(4)]
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(lane))
         shading, s = mi.Vector3f(e[1].x, e[1].y, e[1].z), mi.Vector3f(e[0].x, e[0].y, e[0].z)
@@ -185,50 +212,53 @@ def _points(scene, surface, table, rows, bins, n_texels):
         si.n = si.sh_frame.n
         si.uv = mi.Point2f(e[0].w, e[1].w)
         si.wi = mi.Vector3f(e[2].x, e[2].y, e[2].z)
-        weight, shape, odd = e[3].x, e[2].w, e[3].w > 0
         bsdf = dr.reinterpret_array(mi.BSDFPtr, dr.reinterpret_array(mi.UInt32, e[3].y))
         record = dr.reinterpret_array(mi.UInt32, e[3].z)
+        values = []
+        for j in range(block):
+            row = dr.gather(mi.Array4f, table, dr.fma(record, light_count, index[j]))
+            # Zero where the light is hidden.
+            direct = bsdf.eval(context, si, si.to_local(vectors[j]), row.w != 0)
+            values.append(dr.fma(mi.Color3f(row.x, row.y, row.z), e[2].w, direct * row.w))
+        return e[3].x, e[3].w, record, values
+
+    colours = tuple(mi.Color3f(zero) for _ in range(block))
+
+    def step_of_means(entry, sums):
+        part, _, _, values = entry_values(entry)
+        return entry + 1, tuple(dr.fma(part, value, a) for value, a in zip(values, sums, strict=True))
+
+    if not variance:
+        _, sums = dr.while_loop((begin, colours), lambda entry, *_: entry < end, step_of_means)
+        return list(sums), None
+
+    def step(entry, scale, weights, last_w, last_pair, last, dd, dx, dw, sums):
+        part, weight, record, values = entry_values(entry)
         # The partner of the same stratum comes just before; alone in the texel, an entry differs from 0.
         pair = record >> 1
         together = pair == last_pair
-        row = [dr.gather(mi.Array4f, table, dr.fma(record, light_count, i)) for i in index]
-        lit = [one.w != 0 for one in row]
         last, dd, dx, sums = list(last), list(dd), list(dx), list(sums)
         kept_w = dr.select(together, last_w, 0)
         for j in range(block):
-            broad = mi.Color3f(row[j].x, row[j].y, row[j].z)
-            direct = bsdf.eval(lobes.full, si, si.to_local(vectors[j]), lit[j])
-            value = weight * dr.fma(broad, shape, dr.select(lit[j], direct * row[j].w, 0))
+            sums[j] = dr.fma(part, values[j], sums[j])
+            value = weight * values[j]
             kept = dr.select(together, last[j], 0)
             dd[j] = dr.fma(value, value - 2 * kept, dd[j])
             dx[j] = dr.fma(value, weight - kept_w, dr.fma(-kept, weight, dx[j]))
             last[j] = value
-            sums[j] = sums[j] + dr.select(odd, 0, value)
-            sums[block + j] = sums[block + j] + dr.select(odd, value, 0)
         dw = dr.fma(weight, weight - 2 * kept_w, dw)
-        split = (dr.select(odd, 0, weight), dr.select(odd, weight, 0))
-        weights = tuple(a + b for a, b in zip(weights, split, strict=True))
-        squares = tuple(dr.fma(b, b, a) for a, b in zip(squares, split, strict=True))
-        return entry + 1, weights, squares, weight, pair, tuple(last), tuple(dd), tuple(dx), dw, tuple(sums)
+        weights = weights[0] + weight, dr.fma(weight, weight, weights[1])
+        scale = dr.fma(part, part, scale)
+        return entry + 1, scale, weights, weight, pair, tuple(last), tuple(dd), tuple(dx), dw, tuple(sums)
 
-    colours = tuple(mi.Color3f(zero) for _ in range(block))
     nothing = dr.full(mi.UInt32, 0xFFFFFFFF, dr.width(lane))
-    state = (
-        begin, (zero, zero), (zero, zero), zero, nothing, colours, colours, colours, zero, (*colours, *colours)
-    )  # fmt: skip
+    state = (begin, zero, (zero, zero), zero, nothing, colours, colours, colours, zero, colours)
     state = dr.while_loop(state, lambda entry, *_: entry < end, step)
-    _, (one, two), squares, _, _, _, dd, dx, dw, sums = state
-    inverse = dr.select(one + two > 0, dr.rcp(one + two), 0)
-    shares = [dr.select(a > 0, (0.5 + 0.5 * (a - b)) / a, 0) for a, b in ((one, two), (two, one))]
+    _, scale, (total, both), _, _, _, dd, dx, dw, means = state
     # Variance of the entries' sum with the halves' shares, and what the slope takes of the degrees of freedom.
-    both = squares[0] + squares[1]
-    scale = dr.fma(squares[0], dr.square(shares[0]), squares[1] * dr.square(shares[1]))
-    scale *= dr.select(both > 0, dr.rcp(both), 0) / dr.maximum(
-        1 - both * dr.square(inverse), 1 / LEAST_FREEDOM
-    )
-    means = [shares[0] * sums[j] + shares[1] * sums[block + j] for j in range(block)]
-    slopes = [(sums[j] + sums[block + j]) * inverse for j in range(block)]
+    freedom = 1 - both * dr.square(dr.select(total > 0, dr.rcp(total), 0))
+    scale *= dr.select(both > 0, dr.rcp(both), 0) / dr.maximum(freedom, 1 / LEAST_FREEDOM)
     spread = [
-        scale * dr.maximum(dd[j] - 2 * slopes[j] * dx[j] + dr.square(slopes[j]) * dw, 0) for j in range(block)
+        scale * dr.maximum(dd[j] - 2 * means[j] * dx[j] + dr.square(means[j]) * dw, 0) for j in range(block)
     ]
-    return means, spread
+    return list(means), spread

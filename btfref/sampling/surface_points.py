@@ -58,9 +58,9 @@ def sample_points(triangles, density, count, rng):
 
 
 def centroids(triangles):
-    """The centroids of all triangles, as `Points` without weight."""
+    """The centroids of all triangles, as `Points` whose weights are the triangles' areas."""
     bary = np.full((len(triangles.area), 3), 1 / 3)
-    return _at(triangles, bary, np.zeros(len(triangles.area)))
+    return _at(triangles, bary, triangles.area)
 
 
 def _at(triangles, bary, weight):
@@ -109,6 +109,10 @@ class Bins:
         What a photon that starts at an entry drawn by weight counts.
     start : ndarray (texels + 1,) uint32
         Where a texel's entries begin.
+    totals : ndarray (2, texels)
+        Sum of weights of each half and texel.
+    part : ndarray (E,) float32
+        Weight of an entry in the mean of both halves, each corrected by the other (`surface_gather`).
     """
 
     record: np.ndarray
@@ -116,10 +120,15 @@ class Bins:
     half: np.ndarray
     flux: np.ndarray
     start: np.ndarray
+    totals: np.ndarray
+    part: np.ndarray
 
     @classmethod
     def sorted(cls, texel, record, weight, half, flux, n_texels):
         """From entries in the order of their records."""
+        totals = np.bincount(half * n_texels + texel, weight, 2 * n_texels).reshape(2, -1)
+        shares = np.where(totals > 0, 0.5 * (1 + totals - totals[::-1]) / np.maximum(totals, 1e-300), 0.0)
+        part = weight * shares[half, texel]
         # Two bytes are sorted by radix; the order inside a texel stays.
         order = np.argsort(texel.astype(np.uint16) if n_texels <= 1 << 16 else texel, kind="stable")
         start = np.concatenate([[0], np.cumsum(np.bincount(texel, minlength=n_texels))])
@@ -129,19 +138,9 @@ class Bins:
             half[order].astype(np.uint8),
             flux[order].astype(np.float32),
             start.astype(np.uint32),
+            totals,
+            part[order].astype(np.float32),
         )
-
-    @property
-    def texel(self):
-        """Texel of each entry."""
-        return np.repeat(np.arange(len(self.start) - 1), np.diff(self.start.astype(np.int64)))
-
-    def totals(self):
-        """Sum of weights of each half and texel: (2, texels)."""
-        n_texels = len(self.start) - 1
-        return np.bincount(
-            self.texel + n_texels * self.half.astype(np.int64), self.weight, 2 * n_texels
-        ).reshape(2, -1)
 
 
 def starts(bins):

@@ -1,8 +1,14 @@
 """Walks from the texels of every direction by the rest of the BSDF, used both ways.
 
 For a view they bring light by way of the rest; for a light they are photons, which bring light by way of
-the rest and then of the broad lobe of what they hit (caustics). Where a light's direction is a view's as
-well, both come from the same walk.
+the rest to what they hit, and from there to all views. Where a light's direction is a view's as well, both come
+from the same walk.
+
+A path v – p – q – l by way of the rest at both p and q is found by walks from v, whose direction at p is drawn, and by
+photons from l, whose direction at q is: each counts by the balance heuristic (Veach 1997, sec. 9.2.2). Per area
+of both vertices and walks per texel alike, the densities are ``|n_p·v|/v_z pdf_p |n_q·ω| / r²`` and
+``|n_q·l|/l_z pdf_q |n_p·ω| / r²``; where one lobe peaks, the walk that drew the other one counts little. Light by way
+of the broad lobe at q comes with the walks from v alone, and of that at p with the photons alone.
 """
 
 from __future__ import annotations
@@ -12,12 +18,12 @@ import numpy as np
 from btfref.numerics.transfer import to_device
 from btfref.sampling.surface_points import starts
 from btfref.sampling.surface_walks import Surface, connect, continue_walks
-from btfref.sampling.tiled_scene import stream_keys, uniforms
+from btfref.sampling.tiled_scene import rotated, stream_keys, uniforms
 
 #: Walks that start together: a bound on memory, without influence on the result.
 TOGETHER = 1 << 20
 
-_REST, _NONE = 3, 0xFFFFFFFF
+_NONE = 0xFFFFFFFF
 
 #: Random streams of a texel; beyond them neighbours share numbers.
 STREAMS = 1024
@@ -105,12 +111,13 @@ class TexelWalks:
         One per direction.
     per_half : int
         Walks per direction, texel and half.
-    n_texels, n_vertices, seed : int
+    n_texels, n_vertices, seed, stream : int
     """
 
-    def __init__(self, scene, surface, bins, *, per_half, n_texels, n_vertices, seed):
+    def __init__(self, scene, surface, bins, *, per_half, n_texels, n_vertices, seed, stream):
         self.scene, self.per_half, self.n_texels = scene, per_half, n_texels
-        self.n_vertices, self.seed = n_vertices, seed
+        self.n_vertices = n_vertices
+        self.keys = stream_keys(seed, stream)
         each = 2 * per_half * n_texels
         step = max(1, TOGETHER // each)
         parts = []
@@ -138,12 +145,15 @@ class TexelWalks:
         direction = place + dr.opaque(mi.UInt32, first)
         key = dr.gather(mi.UInt32, to_device(mi.UInt32, stream_numbers(scene.directions)), direction)
         stream = key + texel * STREAMS + 2 * sample + half
-        keys = stream_keys(self.seed, _REST)
+        keys = self.keys
         pick, _, _, _ = uniforms(stream, keys, mi.UInt32(0))
         entry, valid = _choose(bins, place * n_texels + texel, half, (mi.Float(sample) + pick) / per_half)
         record = to_device(mi.UInt32, np.concatenate([some.record for some in bins]))
         flux = to_device(mi.Float, np.concatenate([some.flux for some in bins]))
-        lobe, u, v, choice = uniforms(stream, keys, mi.UInt32(1))
+        lobe, _, _, choice = uniforms(stream, keys, mi.UInt32(1))
+        # The walks of a texel share a random place in the square, from where they fill it evenly.
+        u, v, _, _ = uniforms(stream - 2 * sample, keys, mi.UInt32(2))
+        u, v = rotated(u, v, sample)
         w = dr.gather(mi.Vector3f, scene.cache.vectors, direction)
         si, bsdf, number, albedo = surface.interaction(dr.gather(mi.UInt32, record, entry, valid), valid)
         si.wi = si.to_local(w)
@@ -154,20 +164,25 @@ class TexelWalks:
         # geometry that shading normals leave unbalanced (Veach 1997, sec. 5.3).
         back = type(si)(si)
         back.wi = drawn.wo
+        facing = dr.abs(dr.dot(si.n, ray.d))
+        density = dr.abs(dr.dot(si.n, w)) / w.z * drawn.pdf
         power = lobes.eval_rest(bsdf, number, albedo, back, si.to_local(w), active)
-        power *= dr.abs(dr.dot(si.n, ray.d)) / (dr.abs(dr.dot(si.n, w)) * drawn.pdf)
+        power *= facing / (dr.abs(dr.dot(si.n, w)) * drawn.pdf)
         power = dr.select(active & (drawn.pdf > 0), power * dr.gather(mi.Float, flux, entry, valid), 0)
         state = [mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Color3f(power), mi.Color3f(weight), stream, choice]
+        state += [facing, density]
         dr.eval(state, active)
         alive = dr.compress(active)
         if dr.width(alive) == 0:
             return None
-        origin, towards, power, weight, stream, choice = (dr.gather(type(a), a, alive) for a in state)
+        origin, towards, power, weight, stream, choice, facing, density = (
+            dr.gather(type(a), a, alive) for a in state
+        )
         hit, found = scene.tiles.locate(origin, towards)
         surface = Surface.of_interaction(hit, lobes)
         row = scene.cache.row(found, surface.number)
         reached = hit.is_valid()
-        dr.eval(row, reached, towards, power, weight, stream, choice)
+        dr.eval(row, reached, towards, power, weight, stream, choice, facing, density)
         there = dr.compress(reached)
         if dr.width(there) == 0:
             return None
@@ -179,6 +194,8 @@ class TexelWalks:
                 ("power", power),
                 ("lane", stream),
                 ("choice", choice),
+                ("facing", facing),
+                ("density", density),
             )
         }
         gathered["wi"] = -dr.gather(mi.Vector3f, towards, there)
@@ -190,19 +207,18 @@ class TexelWalks:
         return gathered | numbers | {"surface": surface.taken(there)}
 
     def _look(self):
-        """Visibility of the hits, and the power of the photons but for what depends on the view."""
+        """Visibility of the hits, and what does not depend on where they send light."""
         import drjit as dr
         import mitsuba as mi
 
         scene, hits = self.scene, self.hits
         surface, incoming = hits["surface"], hits["wi"]
-        si, _, number, albedo = surface.interaction(None)
+        si, *_ = surface.interaction(None)
         hits["coded"] = scene.cache.sights(scene.tiles, si, hits["row"], hits["choice"], towards=incoming)
-        cosine = dr.dot(surface.shading, incoming)
+        cosine = dr.abs(dr.dot(surface.n, incoming))
         z = to_device(mi.Float, scene.directions[hits["direction"], 2])
-        power = hits["power"] * albedo * scene.lobes.shape(number, cosine) * dr.maximum(cosine, 0)
-        power *= dr.inv_pi * z / (dr.abs(dr.dot(surface.n, incoming)) * 2 * self.per_half)
-        hits["power"] = mi.Color3f(power)
+        hits["power"] *= z / (cosine * 2 * self.per_half)
+        hits["density"] *= cosine
         bright = dr.max(dr.abs(hits["power"])) > 0
         self.photons = dr.compress(bright)
         first = np.searchsorted(self.photons.numpy(), self.range)
@@ -240,14 +256,23 @@ class TexelWalks:
         si.wi = si.to_local(dr.gather(mi.Vector3f, hits["wi"], at))
         weight, share = dr.gather(mi.Color3f, hits["weight"], at), dr.opaque(mi.Float, 1 / self.per_half)
         n, coded = dr.opaque(mi.UInt32, cache.n), hits["coded"]
+        facing, density = (dr.gather(mi.Float, hits[name], at) for name in ("facing", "density"))
 
-        def sees(k):
-            return cache.value(dr.gather(mi.UInt8, coded, dr.fma(at, n, k)))
+        def bring(w, k):
+            seen = cache.value(dr.gather(mi.UInt8, coded, dr.fma(at, n, k)))
+            local, lit = si.to_local(w), seen != 0
+            value = lobes.eval_rest(bsdf, number, albedo, si, local, lit)
+            back = type(si)(si)
+            back.wi = local
+            spread = dr.abs(dr.dot(si.n, w)) / w.z
+            other = spread * facing * lobes.pdf_rest(bsdf, back, si.wi, lit)
+            value *= density / dr.maximum(density + other, 1e-30)
+            return share * weight * seen * (value + lobes.value(number, albedo, si.wi, local))
 
-        connect(lobes, lights, target, (si, bsdf, number, albedo, share * weight), offset, sees, stride=3)
+        connect(lights, target, offset, bring, stride=3)
         if self.n_vertices < 3:
             return
-        keys = stream_keys(self.seed, _REST)
+        keys = self.keys
         lane = dr.gather(mi.UInt32, hits["lane"], at)
         lobe, u, v, _ = uniforms(lane, keys, mi.UInt32(4))
         drawn, gain = bsdf.sample(lobes.full, si, lobe, mi.Point2f(u, v))
@@ -264,12 +289,12 @@ class TexelWalks:
             vertex=3, last=self.n_vertices, stride=3, broad_first=False, count=self.per_half,
         )  # fmt: skip
 
-    def splatted(self, rows, texels):
-        """Photons as the texels of some directions see them: sums and sums of squares.
+    def splatted(self, rows, texels, variance=True):
+        """Photons as the texels of some directions see them: sums, and with a variance sums of squares.
 
         Returns
         -------
-        tuple of mitsuba.Float
+        list of mitsuba.Float
             [direction, light, texel, 3] each.
         """
         import drjit as dr
@@ -278,10 +303,10 @@ class TexelWalks:
         scene, lights, hits = self.scene, self.scene.lights, self.hits
         n_lit = lights.count
         size = len(rows) * self.n_texels * n_lit * 3
-        sums, squares = dr.zeros(mi.Float, size), dr.zeros(mi.Float, size)
-        if hits is None or not scene.lobes.any:
-            return sums, squares
-        surface, cache = hits["surface"], scene.cache
+        targets = [dr.zeros(mi.Float, size) for _ in range(1 + variance)]
+        if hits is None:
+            return targets
+        surface, cache, lobes = hits["surface"], scene.cache, scene.lobes
         # A lane is a light and a view. Few as they are, they are spread so that every thread gets its share.
         each = -(-n_lit * len(rows) // dr.thread_count())
         lane = dr.arange(mi.UInt32, max(BLOCK, each) * dr.thread_count())
@@ -302,11 +327,16 @@ class TexelWalks:
         def step(entry):
             i = dr.gather(mi.UInt32, self.photons, entry)
             seen = cache.value(dr.gather(mi.UInt8, hits["coded"], dr.fma(i, n, row)))
-            number = dr.gather(mi.UInt32, surface.number, i)
-            shape = scene.lobes.shape(number, dr.dot(dr.gather(mi.Vector3f, surface.shading, i), w))
-            factor = seen * shape * dr.abs(dr.dot(dr.gather(mi.Vector3f, surface.n, i), w)) / w.z
-            value = dr.gather(mi.Color3f, hits["power"], i) * factor
-            p = dr.gather(mi.Point3f, surface.p, i)
+            si, bsdf, number, albedo = surface.interaction(i)
+            si.wi, incoming = si.to_local(w), si.to_local(dr.gather(mi.Vector3f, hits["wi"], i))
+            spread = dr.abs(dr.dot(si.n, w)) / w.z
+            facing, density = (dr.gather(mi.Float, hits[name], i) for name in ("facing", "density"))
+            value = lobes.eval_rest(bsdf, number, albedo, si, incoming, seen != 0)
+            other = spread * facing * lobes.pdf_rest(bsdf, si, incoming, seen != 0)
+            value *= density / dr.maximum(density + other, 1e-30)
+            value += lobes.value(number, albedo, si.wi, incoming)
+            value *= seen * spread * dr.gather(mi.Color3f, hits["power"], i)
+            p = si.p
             x, y = p.x - p.z * w.x / w.z, p.y - p.z * w.y / w.z
             column = dr.minimum(mi.UInt32((x - dr.floor(x)) * width), width - 1)
             line = dr.minimum(mi.UInt32((y - dr.floor(y)) * height), height - 1)
@@ -314,13 +344,13 @@ class TexelWalks:
             bright = dr.max(dr.abs(value)) > 0
             for channel in range(3):
                 # A lane has one view and one light: its entries are its own, its order that of the photons.
-                for target, term in ((sums, value[channel]), (squares, dr.square(value[channel]))):
+                for target, term in zip(targets, (value[channel], dr.square(value[channel])), strict=False):
                     dr.scatter_add(target, term, at + channel, bright, mode=dr.ReduceMode.NoConflicts)
             return (entry + 1,)
 
         dr.while_loop((begin,), lambda entry: entry < end, step)
-        dr.eval(sums, squares)
-        return sums, squares
+        dr.eval(targets)
+        return targets
 
 
 def _joined(parts):

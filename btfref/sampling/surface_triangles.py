@@ -9,6 +9,9 @@ import numpy as np
 #: Share of the points that goes by area alone: what the pilot rays took for hidden is sampled as well.
 FLOOR = 0.25
 
+#: Share of the other points that goes by the spread of direct light.
+VARIED = 0.5
+
 #: Side of the cells over which the pilot's findings are smoothed, in tile units: a triangle whose centroid is
 #: hidden may still show a corner, and few points of large weight are the worst of all.
 CELL = 1 / 48
@@ -173,7 +176,7 @@ def _morton(points):
     return key
 
 
-def density(triangles, views, visible):
+def density(triangles, views, visible, varied):
     """Points per area of each triangle, relative, to see every view's texels about equally well.
 
     Parameters
@@ -182,11 +185,14 @@ def density(triangles, views, visible):
     views : ndarray (V, 3)
     visible : ndarray (V, T) bool
         From pilot rays at the centroids.
+    varied : ndarray (T,)
+        Spread of light inside texels, see `surface_pilot.contrast`.
 
     Returns
     -------
     ndarray (T,)
-        ``√mean_v ((n·v)/v_z)² V`` (the density of least mean variance) and a floor by area.
+        A mixture of ``varied``, of ``√mean_v ((n·v)/v_z)² V`` (the density of least mean variance where light
+        varies alike everywhere, as indirect light does) and of a floor by area.
     """
     cosine = views @ triangles.facet.T
     scale = np.where(visible, np.abs(cosine) / views[:, 2:], 0.0)
@@ -194,9 +200,13 @@ def density(triangles, views, visible):
     cell = np.floor(triangles.corners.mean(1) / CELL).astype(np.int64) % (1 << 18)
     key = (((triangles.part - ABSORBER) * (1 << 18) + cell[:, 0]) << 36) + (cell[:, 1] << 18) + cell[:, 2]
     _, key = np.unique(key, return_inverse=True)
+    total = triangles.area.sum()
+    mean = (wanted * triangles.area).sum() / total
+    spread = (varied * triangles.area).sum() / total
+    if spread > 0:
+        wanted = (1 - VARIED) * wanted + VARIED * mean / spread * varied
     around = np.bincount(key, wanted * triangles.area) / np.bincount(key, triangles.area)
     wanted = 0.5 * (wanted + around[key])
-    mean = (wanted * triangles.area).sum() / triangles.area.sum()
     result = wanted + FLOOR * mean
     hidden = triangles.part == ABSORBER
     if not wanted[hidden].any():

@@ -179,39 +179,27 @@ class Lights:
         return dr.width(self.rows)
 
 
-def connect(lobes, lights, target, vertex, offset, sees, *, stride, broad=False):
-    """Add weight · BSDF · cosine · visibility of all lights to ``target``.
+def connect(lights, target, offset, bring, *, stride):
+    """Add what a vertex gets from all lights to ``target``.
 
     Parameters
     ----------
     lights : Lights
     target : mitsuba.Float
-    vertex : tuple
-        Surface interactions with ``wi``, BSDF pointers, their numbers, ρ (or None) and weight.
     offset : mitsuba.UInt32
         Where in ``target`` a lane's first light goes; each ``stride`` further.
-    sees : callable
-        ``sees(row) -> mitsuba.Float``, the visibility along a direction.
-    broad : bool
-        Only the broad lobe.
+    bring : callable
+        ``bring(w, row) -> mitsuba.Color3f``: weight · BSDF · cosine · visibility of a light and the number of its
+        direction.
     """
     import drjit as dr
     import mitsuba as mi
 
-    si, bsdf, number, albedo, weight = vertex
     count = dr.opaque(mi.UInt32, lights.count)
 
     def step(i):
-        w = dr.gather(mi.Vector3f, lights.vectors, i)
-        seen = sees(dr.gather(mi.UInt32, lights.rows, i))
-        lit = seen != 0
-        local = si.to_local(w)
-        if broad:
-            value = lobes.value(number, albedo, si.wi, local)
-        else:
-            value = bsdf.eval(lobes.full, si, local, lit)
-        value = weight * value * seen
-        lit &= dr.max(dr.abs(value)) > 0
+        value = bring(dr.gather(mi.Vector3f, lights.vectors, i), dr.gather(mi.UInt32, lights.rows, i))
+        lit = dr.max(dr.abs(value)) > 0
         at = dr.fma(i, stride, offset)
         for channel in range(3):
             # Each lane owns its entries: no atomics, and the same bytes every time.
@@ -287,18 +275,16 @@ def continue_walks(
         coded = cache.sights(tiles, si, row, choice, towards=-direction)
         n, at = dr.opaque(mi.UInt32, cache.n), dr.arange(mi.UInt32, dr.width(lane))
 
-        def sees(k, coded=coded, n=n, at=at):
-            return cache.value(dr.gather(mi.UInt8, coded, dr.fma(at, n, k)))
+        def bring(
+            w, k, vertex=(si, bsdf, number, albedo, share * weight), coded=coded, n=n, at=at, broad=broad
+        ):
+            si, bsdf, number, albedo, weight = vertex
+            seen = cache.value(dr.gather(mi.UInt8, coded, dr.fma(at, n, k)))
+            local = si.to_local(w)
+            if broad:
+                return weight * lobes.value(number, albedo, si.wi, local) * seen
+            return weight * bsdf.eval(lobes.full, si, local, seen != 0) * seen
 
-        connect(
-            lobes,
-            lights,
-            target,
-            (si, bsdf, number, albedo, share * weight),
-            offset,
-            sees,
-            stride=stride,
-            broad=broad,
-        )
+        connect(lights, target, offset, bring, stride=stride)
         first = False
         vertex += 1

@@ -163,3 +163,26 @@ def stream_keys(*words):
 
     state = np.random.SeedSequence([int(word) for word in words]).generate_state(2, np.uint32)
     return [dr.opaque(mi.UInt32, int(word)) for word in state]
+
+
+def rotated(u, v, number):
+    """Two numbers in [0, 1) moved along the R2 sequence (Roberts 2018), modulo 1.
+
+    Any of them is as uniform as the first; those of successive numbers fill the square evenly.
+
+    Parameters
+    ----------
+    u, v : mitsuba.Float
+    number : mitsuba.UInt32
+
+    Returns
+    -------
+    tuple of mitsuba.Float
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    # Multiples modulo 2^32 are exact; floats of large numbers would be a coarse lattice.
+    shift = (mi.Float((number * mi.UInt32(a)) >> 8) * 2.0**-24 for a in (3242174889, 2447445414))
+    moved = (x + y for x, y in zip((u, v), shift, strict=True))
+    return tuple(x - dr.select(x >= 1, 1, 0) for x in moved)

@@ -18,25 +18,30 @@ TEXELS = 8
 RNG = np.random.default_rng(75)
 CHOSEN = [*RNG.choice(57, 4, replace=False).tolist(), *(57 + RNG.choice(24, 2, replace=False)).tolist()]
 
-#: Runs of different seeds, whose spread is the synthesis' own noise; samples of each.
-RUNS, SPP = 6, {"path": 256, "surface": 64}
+#: Runs of different seeds, whose spread is the synthesis' own noise, and samples of each. Points and walks are shared
+#: by all pairs: as many of them as paths leave the mean of all pairs several times noisier.
+RUNS, SPP = {"path": 6, "surface": 12}, {"path": 256, "surface": 1024}
+
+#: Runs and samples where a difference of some percent is all that is looked for.
+FEW_RUNS, FEW_SPP = 6, {"path": 256, "surface": 64}
 
 #: Plain renders of each pair, and samples of each.
-ROUNDS, ROUND_SPP = 16, 256
+ROUNDS, ROUND_SPP = 16, 1024
 
 
-def _runs(tile, estimator, max_depth=8):
+def _runs(tile, estimator, *, runs, spp, max_depth=8):
     vectors = directions("ubo81").vectors[CHOSEN]
     settings = {"texels": TEXELS, "views": vectors, "lights": vectors, "dtype": "float32"}
-    settings |= {"estimator": estimator, "spp": SPP[estimator], "max_depth": max_depth}
-    return np.stack([synthesize(tile, seed=seed, **settings).values for seed in range(RUNS)])
+    settings |= {"estimator": estimator, "spp": spp, "max_depth": max_depth}
+    return np.stack([synthesize(tile, seed=seed, **settings).values for seed in range(runs)])
 
 
 def _compare(llvm, name, estimator, n_pairs, rounds):
     """Rejected texels, and the relative mean bias of all pairs with its standard error."""
     tile = build(name)
     vectors = directions("ubo81").vectors[CHOSEN]
-    values = _runs(tile, estimator).astype(np.float64)
+    runs = RUNS[estimator]
+    values = _runs(tile, estimator, runs=runs, spp=SPP[estimator]).astype(np.float64)
     plain = PlainRenders(llvm, tile, texels=TEXELS, reach=3, max_depth=8)
     index = np.random.default_rng(30).choice(len(CHOSEN) ** 2, n_pairs, replace=False)
     means, p, theirs, noise = [], [], [], []
@@ -46,16 +51,16 @@ def _compare(llvm, name, estimator, n_pairs, rounds):
             vectors[v], vectors[k], spp=ROUND_SPP, rounds=rounds, seed=100 * (6 * v + k)
         )
         ours = values[:, v, k]
-        spread = ours.var(0, ddof=1) / RUNS
+        spread = ours.var(0, ddof=1) / runs
         # Where neither ever varied, rounding is all that can differ.
         floor = (tolerance("synthesis.rounding") * image.max()) ** 2
-        p.append(welch_test(ours.mean(0), spread + floor, image, variance + floor, n_a=RUNS, n_b=rounds)[1])
+        p.append(welch_test(ours.mean(0), spread + floor, image, variance + floor, n_a=runs, n_b=rounds)[1])
         means.append(ours.mean((1, 2, 3)))
         theirs.append(image.mean())
         noise.append(3 * variance.sum() / image.size**2)
     # Pairs share points and walks: the spread of whole runs holds what goes together.
     whole = np.mean(means, axis=0)
-    error = np.sqrt(whole.var(ddof=1) / RUNS + np.sum(noise) / n_pairs**2) / np.mean(theirs)
+    error = np.sqrt(whole.var(ddof=1) / runs + np.sum(noise) / n_pairs**2) / np.mean(theirs)
     rejected = difference_test(np.stack(p), significance=tolerance("closing_loop.difference.significance"))
     return rejected.rejected_fraction, whole.mean() / np.mean(theirs) - 1, error
 
@@ -73,5 +78,8 @@ def test_thirty_pairs_equal_plain_renders(llvm, name, estimator):
 
 @pytest.mark.parametrize("estimator", ["path", "surface"])
 def test_interreflection_adds_light(estimator):
-    deep, direct = (_runs(build("rings"), estimator, depth).mean((0, 3, 4, 5)) for depth in (8, 2))
+    settings = {"runs": FEW_RUNS, "spp": FEW_SPP[estimator]}
+    deep, direct = (
+        _runs(build("rings"), estimator, max_depth=depth, **settings).mean((0, 3, 4, 5)) for depth in (8, 2)
+    )
     assert deep.mean() / direct.mean() > 1 + 10 * tolerance("synthesis.surface.bias")
