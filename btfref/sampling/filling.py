@@ -114,6 +114,8 @@ def _fill_by_texels(job, store, views, only, plan, size):
                     whole[:, at[:, 0], at[:, 1]] = values
                     values = whole
                 result.append(values.reshape(shape))
+            if not store.has_variance:
+                result = result[:1]
             if plan is not None:
                 _record_part(store, view, row, column, inside, adaptive.texel_means(*result))
             store.write_part(view, lights, tuple(chosen), *result, origin=(row.start, column.start))
@@ -150,7 +152,7 @@ def _fill_by_views(job, store, views, only, plan, size):
             chosen = np.asarray(chosen)
             estimator = job.make_estimator(group, lights=chosen, mask=mask)
             for view, mean, variance in estimator.all_views(group):
-                store.write_part(view, chosen, tiles, mean, variance)
+                store.write_part(view, chosen, tiles, mean, variance if store.has_variance else None)
                 if len(chosen) == len(lights):
                     yield view
             del estimator

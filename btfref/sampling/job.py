@@ -56,6 +56,7 @@ class Job:
         variant,
         target_error,
         texel_error,
+        variance=True,
     ):
         sides = texels if np.ndim(texels) else (texels, texels)
         if len(sides) != 2:
@@ -67,6 +68,11 @@ class Job:
         self.texel_error = _share("texel_error", texel_error)
         if self.target_error is None and texel_error is not None:
             raise InputError("without a target error", field="texel_error", got=texel_error, expected="both")
+        self.variance = bool(variance)
+        if self.target_error is not None and not self.variance:
+            raise InputError(
+                "a target error wants variances", field="variance", got=variance, expected="True"
+            )
         least = 2 if target_error is None else adaptive.LEAST
         most = _LARGEST["spp"] if target_error is None else STREAMS
         spp = (64 if target_error is None else 4096) if spp is None else spp
@@ -114,6 +120,8 @@ class Job:
             },
             "versions": versions(VERSIONS),
         }
+        if not self.variance:
+            self.attributes["parameters"]["variance"] = False
         if fallback is not None:
             self.attributes["fallback"] = f"path instead of surface: {fallback}"
         if self.target_error is not None:
@@ -156,6 +164,8 @@ class Job:
             seed=seed,
             max_depth=self.max_depth,
             **({} if buffer is None else {"buffer": buffer}),
+            # Paths make theirs in passing; they are not kept.
+            **({"variance": self.variance} if self.estimator == "surface" else {}),
         )
 
     def unfinished(self, store, views, stage, only=None):
@@ -180,6 +190,7 @@ class Job:
                 lights=self.lights,
                 texels=self.texels,
                 dtype=self.dtype,
+                variance=self.variance,
                 attributes=self.attributes,
                 adaptive=self.target_error is not None,
             )

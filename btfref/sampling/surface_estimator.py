@@ -35,7 +35,7 @@ from btfref.sampling.surface_cache import LARGEST, LEAST, VisibilityCache
 from btfref.sampling.surface_gather import gather
 from btfref.sampling.surface_pilot import contrast
 from btfref.sampling.surface_points import Bins, centroids, footprints, sample_points
-from btfref.sampling.surface_texels import TexelWalks, lanes
+from btfref.sampling.surface_texels import TOGETHER, TexelWalks, lanes
 from btfref.sampling.surface_triangles import density, triangles
 from btfref.sampling.surface_walks import Lights, Surface, continue_walks, visibility
 from btfref.sampling.tiled_scene import START, TiledScene, rotated, stream_keys, uniforms
@@ -309,19 +309,22 @@ class SurfaceEstimator:
         start = np.flatnonzero(self.used & (albedo.max(1) > 0))
         if not len(start):
             return
-        places = stream_keys(self.seed, _PLACES)
-        for k in range(self.broad_walks):
-            index, lane = (to_device(mi.UInt32, words) for words in (start, self.stream[start]))
-            keys = stream_keys(self.seed, _BROAD, k)
+        keys, places = stream_keys(self.seed, _BROAD), stream_keys(self.seed, _PLACES)
+        count = self.broad_walks
+        step = max(1, TOGETHER // count)
+        for first in range(0, len(start), step):
+            some = np.repeat(start[first : first + step], count)
+            number = dr.arange(mi.UInt32, len(some)) % count
+            index, lane = (to_device(mi.UInt32, words) for words in (some, self.stream[some]))
             # The walks of a point share a random place in the square, from where they fill it evenly.
             u, v, _, _ = uniforms(lane, places, mi.UInt32(0))
-            u, v = rotated(u, v, dr.opaque(mi.UInt32, k))
-            si, _, number, rho = self.surface.interaction(index)
+            u, v = rotated(u, v, number)
+            si, _, kind, rho = self.surface.interaction(index)
             local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(u, v))
-            weight = rho * lobes.shape(number, local.z)
+            weight = rho * lobes.shape(kind, local.z)
             ray = si.spawn_ray(si.to_world(local))
             state = {
-                "lane": lane,
+                "lane": lane * count + number,
                 "target": index * (4 * n_lit),
                 "origin": mi.Point3f(ray.o),
                 "direction": mi.Vector3f(ray.d),
@@ -329,7 +332,7 @@ class SurfaceEstimator:
             }
             continue_walks(
                 scene.tiles, lobes, scene.cache, scene.lights, self.table, state, keys,
-                vertex=2, last=self.n_vertices, stride=4, broad_first=True, count=self.broad_walks,
+                vertex=2, last=self.n_vertices, stride=4, broad_first=True, count=count,
             )  # fmt: skip
 
     # --- results
@@ -360,7 +363,9 @@ class SurfaceEstimator:
             if view not in held:
                 now = live[done : done + together]
                 mean, variance = self._results(now)
-                held = {one: (mean[k], None if variance is None else variance[k]) for k, one in enumerate(now)}
+                held = {
+                    one: (mean[k], None if variance is None else variance[k]) for k, one in enumerate(now)
+                }
             done += 1
             yield view, *(None if part is None else self._all_lights(part) for part in held[view])
 

@@ -58,14 +58,15 @@ def gather(scene, surface, table, rows, bins, *, radiance, splats, texels, varia
 
     n_texels, n_lit = texels[0] * texels[1], scene.lights.count
     shape = (len(rows), n_lit, n_texels, 3)
-    points, spread = _points(scene, surface, table, rows, bins, n_texels, variance)
     n_blocks = -(-n_lit // LIGHTS_PER_LANE)
     halves = np.stack([some.totals for some in bins])  # view, half, texel
     share = to_device(mi.Float, 0.5 + 0.5 * (halves[:, 0] - halves[:, 1]))
 
     lane = dr.arange(mi.UInt32, len(rows) * n_texels * n_blocks)
-    cell, first = lane // n_blocks, (lane % n_blocks) * LIGHTS_PER_LANE
+    order = to_device(mi.UInt32, _order(bins))
+    cell, first = dr.gather(mi.UInt32, order, lane // n_blocks), (lane % n_blocks) * LIGHTS_PER_LANE
     view, texel = cell // n_texels, cell % n_texels
+    points, spread = _points(scene, surface, table, rows, bins, cell, first, variance)
     drafts = [dr.empty(mi.Float, int(np.prod(shape))) for _ in range(1 + variance)]
     mine = dr.gather(mi.Float, share, cell)
     if variance and radiance is not None:
@@ -101,24 +102,37 @@ def gather(scene, surface, table, rows, bins, *, radiance, splats, texels, varia
     return made[0], made[1] if variance else None
 
 
+def _order(bins):
+    """Cells of several bins in the order of their first records: neighbours read the same rows of the table."""
+    offsets = np.cumsum([0, *(len(some.record) for some in bins[:-1])])
+    record = np.concatenate([*(some.record for some in bins), [0]])
+    first = np.concatenate([some.start[:-1] + k for some, k in zip(bins, offsets, strict=True)])
+    return np.argsort(record[np.minimum(first, len(record) - 1)], kind="stable")
+
+
 def _turned(draft, shape, target):
     """From [view, texel, light, 3], as lanes make them, to [view, light, texel, 3], added to a target if any."""
     import drjit as dr
     import mitsuba as mi
 
     _, n_lit, n_texels, _ = shape
-    # Texels of a light next to each other: a line of the draft is still in the cache for the next lights.
+    # Lanes: [view, texels by sixteen, light, one of sixteen]. What sixteen texels have is in the innermost cache
+    # while their lights are written, whole lines each.
+    side = 16 if n_texels % 16 == 0 else 1
     lane = dr.arange(mi.UInt32, dr.width(draft) // 3)
-    texel, rest = lane % n_texels, lane // n_texels
-    value = dr.gather(mi.Color3f, draft, (rest // n_lit * n_texels + texel) * n_lit + rest % n_lit)
+    inner, rest = lane % side, lane // side
+    light, rest = rest % n_lit, rest // n_lit
+    view, texel = rest // (n_texels // side), rest % (n_texels // side) * side + inner
+    value = dr.gather(mi.Color3f, draft, (view * n_texels + texel) * n_lit + light)
+    at = (view * n_lit + light) * n_texels + texel
     if target is None:
         target = dr.empty(mi.Float, dr.width(draft))
     else:
-        value += dr.gather(mi.Color3f, target, lane)
+        value += dr.gather(mi.Color3f, target, at)
 
     def write():
         for channel in range(3):
-            dr.scatter(target, value[channel], 3 * lane + channel)
+            dr.scatter(target, value[channel], 3 * at + channel)
 
     in_one_kernel(dr.width(lane), write)
     dr.eval(target)
@@ -181,20 +195,18 @@ def _packets(scene, surface, rows, bins):
     return packets
 
 
-def _points(scene, surface, table, rows, bins, n_texels, variance):
+def _points(scene, surface, table, rows, bins, cell, first, variance):
     """Mean and its variance from the entries: per light of a lane's block one colour each."""
     import drjit as dr
     import mitsuba as mi
 
     lights, lobes, block = scene.lights, scene.lobes, LIGHTS_PER_LANE
     n_lit = lights.count
-    n_blocks = -(-n_lit // block)
-    lane = dr.arange(mi.UInt32, len(rows) * n_texels * n_blocks)
-    cell, first = lane // n_blocks, (lane % n_blocks) * block
     start = starts(bins)
     n_entries, start = int(start[-1]), to_device(mi.UInt32, start)
     begin, end = dr.gather(mi.UInt32, start, cell), dr.gather(mi.UInt32, start, cell + 1)
-    zero = dr.zeros(mi.Float, dr.width(lane))
+    width = dr.width(cell)
+    zero = dr.zeros(mi.Float, width)
     if n_entries == 0:
         return [[mi.Color3f(zero) for _ in range(block)] for _ in range(2)]
     packets = _packets(scene, surface, rows, bins)
@@ -206,7 +218,7 @@ def _points(scene, surface, table, rows, bins, n_texels, variance):
 
     def entry_values(entry):
         e = [dr.gather(mi.Array4f, packets, entry * 4 + k) for k in range(4)]
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(lane))
+        si = dr.zeros(mi.SurfaceInteraction3f, width)
         shading, s = mi.Vector3f(e[1].x, e[1].y, e[1].z), mi.Vector3f(e[0].x, e[0].y, e[0].z)
         si.sh_frame = mi.Frame3f(s, dr.cross(shading, s), mi.Normal3f(shading))
         si.n = si.sh_frame.n
@@ -251,7 +263,7 @@ def _points(scene, surface, table, rows, bins, n_texels, variance):
         scale = dr.fma(part, part, scale)
         return entry + 1, scale, weights, weight, pair, tuple(last), tuple(dd), tuple(dx), dw, tuple(sums)
 
-    nothing = dr.full(mi.UInt32, 0xFFFFFFFF, dr.width(lane))
+    nothing = dr.full(mi.UInt32, 0xFFFFFFFF, width)
     state = (begin, zero, (zero, zero), zero, nothing, colours, colours, colours, zero, colours)
     state = dr.while_loop(state, lambda entry, *_: entry < end, step)
     _, scale, (total, both), _, _, _, dd, dx, dw, means = state

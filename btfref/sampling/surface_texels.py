@@ -236,11 +236,8 @@ class TexelWalks:
             return target
         index = np.concatenate([np.arange(self.range[k], self.range[k + 1]) for k in rows])
         place = np.repeat(np.arange(len(rows)), [self.range[k + 1] - self.range[k] for k in rows])
-        for sample in range(self.per_half):
-            # Lanes of one sample write to places of their own.
-            mine = hits["sample"][index] == sample
-            if mine.any():
-                self._bring(target, index[mine], place[mine])
+        if len(index):
+            self._bring(target, index, place)
         return target
 
     def _bring(self, target, index, place):
@@ -252,28 +249,36 @@ class TexelWalks:
         lobes, cache = scene.lobes, scene.cache
         slot = (place * 2 + hits["half"][index]) * self.n_texels + hits["texel"][index]
         offset, at = to_device(mi.UInt32, slot * (3 * lights.count)), to_device(mi.UInt32, index)
-        si, bsdf, number, albedo = hits["surface"].interaction(at)
-        si.wi = si.to_local(dr.gather(mi.Vector3f, hits["wi"], at))
-        weight, share = dr.gather(mi.Color3f, hits["weight"], at), dr.opaque(mi.Float, 1 / self.per_half)
-        n, coded = dr.opaque(mi.UInt32, cache.n), hits["coded"]
-        facing, density = (dr.gather(mi.Float, hits[name], at) for name in ("facing", "density"))
+        share, n, coded = dr.opaque(mi.Float, 1 / self.per_half), dr.opaque(mi.UInt32, cache.n), hits["coded"]
 
-        def bring(w, k):
-            seen = cache.value(dr.gather(mi.UInt8, coded, dr.fma(at, n, k)))
-            local, lit = si.to_local(w), seen != 0
-            value = lobes.eval_rest(bsdf, number, albedo, si, local, lit)
-            back = type(si)(si)
-            back.wi = local
-            spread = dr.abs(dr.dot(si.n, w)) / w.z
-            other = spread * facing * lobes.pdf_rest(bsdf, back, si.wi, lit)
-            value *= density / dr.maximum(density + other, 1e-30)
-            return share * weight * seen * (value + lobes.value(number, albedo, si.wi, local))
+        def bring(i):
+            i = dr.gather(mi.UInt32, at, i)
+            si, bsdf, number, albedo = hits["surface"].interaction(i)
+            si.wi = si.to_local(dr.gather(mi.Vector3f, hits["wi"], i))
+            gain = share * dr.gather(mi.Color3f, hits["weight"], i)
+            facing, density = (dr.gather(mi.Float, hits[name], i) for name in ("facing", "density"))
+
+            def from_light(w, k):
+                seen = cache.value(dr.gather(mi.UInt8, coded, dr.fma(i, n, k)))
+                local, lit = si.to_local(w), seen != 0
+                value = lobes.eval_rest(bsdf, number, albedo, si, local, lit)
+                back = type(si)(si)
+                back.wi = local
+                spread = dr.abs(dr.dot(si.n, w)) / w.z
+                other = spread * facing * lobes.pdf_rest(bsdf, back, si.wi, lit)
+                value *= density / dr.maximum(density + other, 1e-30)
+                return gain * seen * (value + lobes.value(number, albedo, si.wi, local))
+
+            return from_light
 
         connect(lights, target, offset, bring, stride=3)
         if self.n_vertices < 3:
             return
         keys = self.keys
         lane = dr.gather(mi.UInt32, hits["lane"], at)
+        si, bsdf, _, _ = hits["surface"].interaction(at)
+        si.wi = si.to_local(dr.gather(mi.Vector3f, hits["wi"], at))
+        weight = dr.gather(mi.Color3f, hits["weight"], at)
         lobe, u, v, _ = uniforms(lane, keys, mi.UInt32(4))
         drawn, gain = bsdf.sample(lobes.full, si, lobe, mi.Point2f(u, v))
         ray = si.spawn_ray(si.to_world(drawn.wo))

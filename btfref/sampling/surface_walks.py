@@ -7,9 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from btfref.numerics.transfer import to_device
+from btfref.numerics.transfer import in_one_kernel, to_device
 from btfref.sampling.path_estimator import ROULETTE_LIMIT, ROULETTE_VERTEX
 from btfref.sampling.tiled_scene import uniforms
+
+#: Lights that one lane serves where vertices are connected to them.
+LIGHTS_PER_LANE = 3
 
 _FIELDS = ("p", "n", "s", "shading", "uv", "number", "albedo")
 
@@ -180,33 +183,60 @@ class Lights:
 
 
 def connect(lights, target, offset, bring, *, stride):
-    """Add what a vertex gets from all lights to ``target``.
+    """Add what vertices get from all lights to ``target``, in the order of the vertices.
 
     Parameters
     ----------
     lights : Lights
     target : mitsuba.Float
     offset : mitsuba.UInt32
-        Where in ``target`` a lane's first light goes; each ``stride`` further.
+        Where in ``target`` the first light of each vertex goes; each ``stride`` further. Vertices may share places.
     bring : callable
-        ``bring(w, row) -> mitsuba.Color3f``: weight · BSDF · cosine · visibility of a light and the number of its
-        direction.
+        ``bring(i)`` for the numbers of some vertices gives a callable of a light, ``(w, row) -> mitsuba.Color3f``:
+        weight · BSDF · cosine · visibility; row is the number of the light's direction.
     """
     import drjit as dr
     import mitsuba as mi
 
-    count = dr.opaque(mi.UInt32, lights.count)
+    # Lanes are places and blocks of lights, neighbours read the same vertices; a place is written once, without
+    # atomics, and the bytes are the same every time.
+    places = offset.numpy()
+    order = np.argsort(places, kind="stable")
+    places = places[order]
+    first = np.flatnonzero(np.concatenate([[True], places[1:] != places[:-1]]))
+    start = to_device(mi.UInt32, np.append(first, len(places)))
+    order, places = to_device(mi.UInt32, order), to_device(mi.UInt32, places[first])
+    n_blocks, count = -(-lights.count // LIGHTS_PER_LANE), dr.opaque(mi.UInt32, lights.count)
+    lane = dr.arange(mi.UInt32, len(first) * n_blocks)
+    blocks = dr.opaque(mi.UInt32, n_blocks)
+    place, light = lane // blocks, (lane % blocks) * LIGHTS_PER_LANE
+    chosen = [dr.minimum(light + j, count - 1) for j in range(LIGHTS_PER_LANE)]
+    vectors = [dr.gather(mi.Vector3f, lights.vectors, k) for k in chosen]
+    rows = [dr.gather(mi.UInt32, lights.rows, k) for k in chosen]
+    begin, end = dr.gather(mi.UInt32, start, place), dr.gather(mi.UInt32, start, place + 1)
 
-    def step(i):
-        value = bring(dr.gather(mi.Vector3f, lights.vectors, i), dr.gather(mi.UInt32, lights.rows, i))
-        lit = dr.max(dr.abs(value)) > 0
-        at = dr.fma(i, stride, offset)
-        for channel in range(3):
-            # Each lane owns its entries: no atomics, and the same bytes every time.
-            dr.scatter_add(target, value[channel], at + channel, lit, mode=dr.ReduceMode.NoConflicts)
-        return (i + 1,)
+    def step(i, sums):
+        from_light = bring(dr.gather(mi.UInt32, order, i))
+        return i + 1, tuple(a + from_light(*light) for a, *light in zip(sums, vectors, rows, strict=True))
 
-    dr.while_loop((dr.zeros(mi.UInt32, dr.width(offset)),), lambda i: i < count, step)
+    zero = dr.zeros(mi.Float, dr.width(lane))
+    state = (begin, tuple(mi.Color3f(zero) for _ in chosen))
+    _, sums = dr.while_loop(state, lambda i, _: i < end, step)
+    at = dr.gather(mi.UInt32, places, place)
+
+    def write():
+        for j, value in enumerate(sums):
+            inside = light + j < count
+            for channel in range(3):
+                dr.scatter_add(
+                    target,
+                    value[channel],
+                    dr.fma(light + j, stride, at) + channel,
+                    inside,
+                    mode=dr.ReduceMode.NoConflicts,
+                )
+
+    in_one_kernel(dr.width(lane), write)
     dr.eval(target)
 
 
@@ -244,19 +274,18 @@ def continue_walks(
             return
         lane, offset, origin, direction, weight = (dr.gather(type(a), a, index) for a in values)
         hit, place = tiles.locate(origin, direction)
-        reached = hit.is_valid()
-        number = dr.select(reached, dr.reinterpret_array(mi.UInt32, hit.bsdf()), 0)
-        row = cache.row(place, number)
-        dr.eval(hit, row, reached, lane, offset, direction, weight)
+        surface, reached = Surface.of_interaction(hit, lobes), hit.is_valid()
+        row = cache.row(place, surface.number)
+        dr.eval(row, reached, lane, offset, direction, weight)
         index = dr.compress(reached)
         if dr.width(index) == 0:
             return
-        si = dr.gather(type(hit), hit, index)
+        surface = surface.taken(index)
         lane, offset, weight, row, direction = (
             dr.gather(type(a), a, index) for a in (lane, offset, weight, row, direction)
         )
-        bsdf = si.bsdf()
-        number = dr.reinterpret_array(mi.UInt32, bsdf)
+        si, bsdf, _, _ = surface.interaction(None)
+        si.wi = si.to_local(-direction)
         depth = dr.opaque(mi.UInt32, 2 * vertex)
         lobe, u, v, _ = uniforms(lane, keys, depth)
         roulette, choice, _, _ = uniforms(lane, keys, depth + 1)
@@ -270,21 +299,35 @@ def continue_walks(
             ray = si.spawn_ray(si.to_world(sample.wo))
             values = [lane, offset, mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Color3f(onward)]
             dr.eval(values, alive)
-        broad = first and broad_first
-        albedo = lobes.albedo(bsdf, number, si) if broad else None
         coded = cache.sights(tiles, si, row, choice, towards=-direction)
-        n, at = dr.opaque(mi.UInt32, cache.n), dr.arange(mi.UInt32, dr.width(lane))
-
-        def bring(
-            w, k, vertex=(si, bsdf, number, albedo, share * weight), coded=coded, n=n, at=at, broad=broad
-        ):
-            si, bsdf, number, albedo, weight = vertex
-            seen = cache.value(dr.gather(mi.UInt8, coded, dr.fma(at, n, k)))
-            local = si.to_local(w)
-            if broad:
-                return weight * lobes.value(number, albedo, si.wi, local) * seen
-            return weight * bsdf.eval(lobes.full, si, local, seen != 0) * seen
-
-        connect(lights, target, offset, bring, stride=stride)
+        vertices = (surface, mi.Vector3f(si.wi), share * weight, coded)
+        dr.eval(vertices[1:], offset)
+        connect(
+            lights, target, offset, _bringing(lobes, cache, vertices, first and broad_first), stride=stride
+        )
         first = False
         vertex += 1
+
+
+def _bringing(lobes, cache, vertices, broad):
+    """What `connect` asks for, at vertices of walks: by the broad lobe alone, or by the whole BSDF."""
+    import drjit as dr
+    import mitsuba as mi
+
+    surface, wi, weight, coded = vertices
+    n = dr.opaque(mi.UInt32, cache.n)
+
+    def bring(i):
+        si, bsdf, number, albedo = surface.interaction(i)
+        si.wi, gain = dr.gather(mi.Vector3f, wi, i), dr.gather(mi.Color3f, weight, i)
+
+        def from_light(w, row):
+            seen = cache.value(dr.gather(mi.UInt8, coded, dr.fma(i, n, row)))
+            local = si.to_local(w)
+            if broad:
+                return gain * lobes.value(number, albedo, si.wi, local) * seen
+            return gain * bsdf.eval(lobes.full, si, local, seen != 0) * seen
+
+        return from_light
+
+    return bring

@@ -157,3 +157,18 @@ def test_paths_take_over_where_points_cannot(bsdf, word):
     assert word in made.attributes["fallback"]
     assert np.array_equal(made.values, synthesize("flat", **settings | {"estimator": "path"}).values)
     assert "fallback" not in synthesize("flat", **SMALL | {"texels": 2}).attributes
+
+
+@pytest.mark.parametrize("estimator", ["path", "surface"])
+def test_variances_may_be_left_out(tmp_path, estimator):
+    settings = SMALL | {"estimator": estimator, "seed": 4, "resolution": 16, "dtype": "float32"}
+    both = synthesize("checker", **settings)
+    alone = synthesize("checker", variance=False, **settings)
+    assert alone.variance is None
+    # Another kernel may round the same sums differently.
+    assert np.abs(alone.values - both.values).max() <= tolerance("synthesis.rounding") * both.values.max()
+    stored = synthesize("checker", variance=False, out=tmp_path / "values.btf.zarr", **settings)
+    assert stored.variance is None
+    assert np.array_equal(stored.values, alone.values)
+    with pytest.raises(InputError, match="variances"):
+        synthesize("checker", variance=False, target_error=0.1, **settings | {"spp": 16})
