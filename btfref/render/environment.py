@@ -143,6 +143,12 @@ class Environment:
         return centre @ self.to_world.T, power
 
 
+def cell_angles(rows=CELL_ROWS):
+    """Solid angles of the cells of :meth:`Environment.cells`, shape (2 rows²,)."""
+    border = np.cos(np.arange(rows + 1) * (np.pi / rows))
+    return np.repeat((border[:-1] - border[1:]) * (np.pi / rows), 2 * rows)
+
+
 def constant(radiance=(1.0, 1.0, 1.0)):
     """The same radiance from everywhere.
 

@@ -3,7 +3,8 @@
 Source: Meseth, Müller, Klein 2004, section 5.2. Differs from it in the foreshortening: their lobes multiply (n · l),
 approximated by (n · t); ours hold it. What lies below the local horizon, which a lobe over the sphere sees and the BTF
 does not, is cut off: the rest is looked up as the lobe that has its integral and its centroid
-(:func:`btfref.render.prefilter.clipped_lobes`).
+(:func:`btfref.render.prefilter.clipped_lobes`), and what is small and bright is no part of the maps
+(:mod:`btfref.render.split_light`).
 
 A class a method, found by the registry: ``SHADER`` provides ``btf_environment``, ``tables`` what it reads, and
 ``radiance`` the same in float64, from the same tables.
@@ -17,6 +18,7 @@ from btfref import conventions
 from btfref.numerics import interpolation
 from btfref.numerics.powers import FLOOR, safe_power
 from btfref.render import prefilter
+from btfref.render.split_light import split_light, unsplit
 from btfref.representations.analytic import held
 from btfref.representations.lafortune import flat_maps
 from btfref.representations.lookup import CHUNK
@@ -30,13 +32,19 @@ class _PrefilteredLobes:
     cosine = False
 
     @classmethod
+    def split(cls, representation, environment):
+        """What is filtered and what becomes lights: a :class:`btfref.render.split_light.SplitLight`."""
+        edge = representation.meta["constants"]["light_edge"]
+        return split_light(environment, edge, cosine=cls.cosine)
+
+    @classmethod
     def tables(cls, representation, environment, *, size=prefilter.SIZE, slices=prefilter.SLICES):
         """Maps of the environment.
 
         Parameters
         ----------
         representation : Representation
-        environment : btfref.render.environment.Environment
+        environment : btfref.render.environment.Environment or btfref.render.split_light.Cells
         size : int
             Texels a side of a parabolic map.
         slices : int
@@ -121,6 +129,11 @@ class Polynomials:
     SHADER = "environment/rf_poly.glsl"
 
     @classmethod
+    def split(cls, representation, environment):
+        """Nothing is taken out: moments hold small lights as well as broad ones."""
+        return unsplit(environment)
+
+    @classmethod
     def tables(cls, representation, environment, *, size=prefilter.SIZE):
         """``environment_moments`` [18, size, size, 3]; see :func:`prefilter.moment_maps`."""
         edge = representation.meta["constants"]["light_edge"]
@@ -153,7 +166,7 @@ class Polynomials:
 
 
 def radiance(representation, tables, uv, w_view, to_world):
-    """Radiance towards the viewer under the environment that ``tables`` hold.
+    """Radiance towards the viewer under the environment that ``tables`` hold, without the lights taken out of it.
 
     Parameters
     ----------

@@ -46,8 +46,8 @@ class LightSet:
         Unit vectors towards the lights, world space.
     power : ndarray of float64, shape (n, 3)
         Irradiance perpendicular to ``w`` in W/m², linear Rec. 709.
-    error : float
-        Estimated relative error; see :func:`estimated_error`.
+    error : float or None
+        Estimated relative error, see :func:`estimated_error`; None where it is not estimated.
     """
 
     w: np.ndarray
@@ -58,9 +58,9 @@ class LightSet:
         return len(self.w)
 
     def table(self):
-        """For ``shaders/environment/lights.glsl``: direction, then power; float32 (n, 2, 4)."""
-        table = np.zeros((len(self), 2, 4), np.float32)
-        table[:, 0, :3], table[:, 1, :3] = self.w, self.power
+        """For ``shaders/lib/environment_lights.glsl``: direction, then power; float32 (n, 2, 4); a black one if n = 0."""
+        table = np.zeros((max(len(self), 1), 2, 4), np.float32)
+        table[: len(self), 0, :3], table[: len(self), 1, :3] = self.w, self.power
         return table
 
 
@@ -94,7 +94,7 @@ def light_set(environment, *, lights=None, target=TARGET):
     w, power = w[lit], power[lit]
     n = FEWEST if lights is None else lights
     while True:
-        found = _divided(w, power, n)
+        found = divided(w, power, n)
         found = LightSet(*found, estimated_error(*found, w, power))
         # More lights than lit cells do not exist.
         if lights is not None or found.error <= target or n >= MOST or len(found) >= len(w):
@@ -102,8 +102,8 @@ def light_set(environment, *, lights=None, target=TARGET):
         n *= 2
 
 
-def _divided(w, power, n):
-    """Directions and powers of at most ``n`` lights that stand for the cells (w, power)."""
+def divided(w, power, n):
+    """Directions and powers of at most ``n`` lights that stand for the cells (w, power), some of them lit."""
     weight = power @ LUMINANCE
     # What has colour has luminance; the floor keeps cells of faint blue.
     weight = np.maximum(weight, 1e-12 * weight.max())

@@ -191,40 +191,34 @@ class Lighting:
 
     def _by_prefiltered(self, representation, file):
         light = image_light(representation.meta["method"], file=file)
-        tables = light.tables(representation, self.environment)
+        split = light.split(representation, self.environment)
+        tables = light.tables(representation, split.rest)
 
         def radiance(uv, w_view, to_world, evaluate=None, place=None):
-            return light.radiance(representation, tables, uv, w_view, to_world)
+            filtered = light.radiance(representation, tables, uv, w_view, to_world)
+            return filtered + lit(representation, split.lights, uv, w_view, to_world, evaluate)
 
-        return Prepared("prefiltered", light.SHADER, tables, radiance)
+        return self._with_lights("prefiltered", light.SHADER, tables, radiance, split.lights)
 
     def _by_lights(self, representation, file):
         found = self.light_set
 
         def radiance(uv, w_view, to_world, evaluate=None, place=None):
-            evaluate = evaluate or (
-                lambda uv, w_light, w_view, _: representation.evaluate(uv, w_light, w_view)
-            )
-            uv, w_view, to_world = (np.asarray(a, float) for a in (uv, w_view, to_world))
-            result = np.zeros((len(uv), 3))
-            step = max(1, BLOCK // len(found))
-            for first in range(0, len(uv), step):
-                part = slice(first, first + step)
-                w_light = np.einsum("li,nij->nlj", found.w, to_world[part])
-                point, light = np.nonzero(w_light[..., 2] > 0)
-                at = first + point
-                value = evaluate(uv[at], w_light[point, light], w_view[at], at) * found.power[light]
-                for k in range(3):
-                    result[part, k] = np.bincount(point, value[:, k], minlength=len(w_light))
-            return result
+            return lit(representation, found, uv, w_view, to_world, evaluate)
 
-        facts = {"environment_lights": len(found), "estimated_error": found.error}
-        tables = {"environment_lights": found.table()}
+        return self._with_lights("lights", "environment/lights.glsl", {}, radiance, found)
+
+    def _with_lights(self, path, shader, tables, radiance, found):
+        """A way that has directional lights, a few a pass."""
+        facts = {"environment_lights": len(found)}
+        if found.error is not None:
+            facts["estimated_error"] = found.error
+        tables = {**tables, "environment_lights": found.table()}
         passes = tuple(
             {"environment_first": first, "environment_end": min(first + PASS, len(found))}
-            for first in range(0, len(found), PASS)
+            for first in range(0, max(len(found), 1), PASS)
         )
-        return Prepared("lights", "environment/lights.glsl", tables, radiance, facts, passes=passes)
+        return Prepared(path, shader, tables, radiance, facts, passes=passes)
 
     def _by_sh(self, representation, file):
         order, light = self._order, self.coefficients
@@ -295,6 +289,40 @@ class Lighting:
         shader = representation.transfer_shader
         passes = tuple({"bin": k, "bin_first": int(first)} for k, first in enumerate(starts[:-1]))
         return Prepared("transfer", shader, tables, radiance, facts, constants, passes, starts, light)
+
+
+def lit(representation, found, uv, w_view, to_world, evaluate=None):
+    """Radiance under directional lights in float64, as ``shaders/lib/environment_lights.glsl`` sums it.
+
+    Parameters
+    ----------
+    representation : Representation
+    found : btfref.render.light_set.LightSet
+    uv : array_like, shape (N, 2)
+    w_view : array_like, shape (N, 3)
+        Local frame.
+    to_world : array_like, shape (N, 3, 3)
+        Columns: the local axes in world space.
+    evaluate : callable, optional
+        In place of the representation's own: see :class:`Prepared`.
+
+    Returns
+    -------
+    ndarray of float64, shape (N, 3)
+    """
+    evaluate = evaluate or (lambda uv, w_light, w_view, _: representation.evaluate(uv, w_light, w_view))
+    uv, w_view, to_world = (np.asarray(a, float) for a in (uv, w_view, to_world))
+    result = np.zeros((len(uv), 3))
+    step = max(1, BLOCK // max(len(found), 1))
+    for first in range(0, len(uv) if len(found) else 0, step):
+        part = slice(first, first + step)
+        w_light = np.einsum("li,nij->nlj", found.w, to_world[part])
+        point, light = np.nonzero(w_light[..., 2] > 0)
+        at = first + point
+        value = evaluate(uv[at], w_light[point, light], w_view[at], at) * found.power[light]
+        for k in range(3):
+            result[part, k] = np.bincount(point, value[:, k], minlength=len(w_light))
+    return result
 
 
 def lighting_of(scene, path="auto", **options):

@@ -235,28 +235,31 @@ def lobe_lookup(maps, clipped, axis, to_world, exponent):
     -------
     ndarray of float64, shape (..., channels)
     """
-    low, f = _between(2 * np.log2(np.maximum(exponent, 1)), len(clipped))
-    f = f[..., None]
-    height = axis[..., 2]
-    share, stretch, z, position = np.moveaxis(
-        (1 - f) * clipped_lookup(clipped, low, height) + f * clipped_lookup(clipped, low + 1, height), -1, 0
-    )
+    share, stretch, z, position = clipped_lobe(clipped, axis[..., 2], exponent)
     moved = np.concatenate([axis[..., :2] * stretch[..., None], z[..., None]], -1)
     world = np.einsum("...ij,...j->...i", to_world, moved)
-    low, f = _between(position, len(maps) // 2)
+    low, f = between(position, len(maps) // 2)
     f = f[..., None]
     mean = (1 - f) * map_lookup(maps, low, world) + f * map_lookup(maps, low + 1, world)
     return (2 * np.pi / (exponent + 1) * share)[..., None] * mean
 
 
+def clipped_lobe(clipped, height, exponent):
+    """The columns of :func:`clipped_lobes` for any height of the axis and any exponent, shape (...) -> (4, ...)."""
+    low, f = between(2 * np.log2(np.maximum(exponent, 1)), len(clipped))
+    f = f[..., None]
+    columns = (1 - f) * clipped_lookup(clipped, low, height) + f * clipped_lookup(clipped, low + 1, height)
+    return np.moveaxis(columns, -1, 0)
+
+
 def clipped_lookup(clipped, index, height):
     """Linear lookup in a row of a table of :func:`clipped_lobes`, shape (...) -> (..., 4)."""
-    low, f = _between((height + 1) * ((clipped.shape[1] - 1) / 2), clipped.shape[1])
+    low, f = between((height + 1) * ((clipped.shape[1] - 1) / 2), clipped.shape[1])
     f = f[..., None]
     return (1 - f) * clipped[index, low].astype(float) + f * clipped[index, low + 1].astype(float)
 
 
-def _between(position, count):
+def between(position, count):
     """The lower of two of ``count`` samples about a position, held at the ends, and the share of the upper one."""
     position = np.clip(position, 0, count - 1)
     low = np.minimum(position.astype(np.int64), count - 2)

@@ -35,7 +35,7 @@ def probe(rep, uv, w_light, w_view, lod=0.0, *, filter_type=None):
     if not len(points):
         return np.zeros((0, 3), np.float32)
     with probe_points(rep, points, filter_type=filter_type) as made:
-        made.run()
+        made.run(uniforms)
         return made.values()
 
 
@@ -147,10 +147,11 @@ class Probe:
         self._owned.append(thing)
         return thing
 
-    def run(self):
-        """Evaluate all points and wait."""
+    def run(self, uniforms=None):
+        """Evaluate all points, with uniforms by name, and wait."""
         self._target.use()
         gl.bind(self._program, self._textures)
+        gl.set_uniforms(self._program, uniforms or {})
         self._vertices.transform(self._result, mode=self.ctx.POINTS, vertices=self._n)
         self.ctx.finish()
 
@@ -171,7 +172,7 @@ def _transformed(tables, host, names, points, uniforms=None):
     if not len(points):
         return np.zeros((0, 3), np.float32)
     with Probe(tables, host, names, points) as made:
-        made.run()
+        made.run(uniforms)
         return made.values()
 
 

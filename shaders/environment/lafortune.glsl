@@ -5,7 +5,7 @@
 #include "lib/lafortune_light.glsl"
 
 // to_world takes local directions to world space.
-vec3 btf_environment(vec2 uv, vec3 w_view, mat3 to_world, float lod) {
+vec3 btf_prefiltered(vec2 uv, vec3 w_view, mat3 to_world) {
     if (!directions_valid(w_view, w_view)) {
         return vec3(0.0);
     }
@@ -22,3 +22,5 @@ vec3 btf_environment(vec2 uv, vec3 w_view, mat3 to_world, float lod) {
     }
     return sum;
 }
+
+#include "lib/split_environment.glsl"

@@ -1,21 +1,9 @@
 // Provides btf_environment of any representation: radiance under the directional lights that stand for an environment.
-// Expects the representation's btf_eval and environment_lights [light, 2, 4]: direction towards it, irradiance.
+// Expects what lib/environment_lights.glsl expects.
 
-#include "lib/table.glsl"
-
-uniform sampler2DArray environment_lights;
-uniform int environment_first;  // light of this pass, and the one after its last
-uniform int environment_end;
+#include "lib/environment_lights.glsl"
 
 // to_world takes local directions to world space.
 vec3 btf_environment(vec2 uv, vec3 w_view, mat3 to_world, float lod) {
-    vec3 sum = vec3(0.0);
-    for (int i = environment_first; i < environment_end; ++i) {
-        // A row vector times the matrix: the transpose takes the world's directions to local ones.
-        vec3 w_light = table_fetch(environment_lights, 2 * i).xyz * to_world;
-        if (w_light.z > 0.0) {
-            sum += table_fetch(environment_lights, 2 * i + 1).rgb * btf_eval(uv, w_light, w_view, lod);
-        }
-    }
-    return sum;
+    return environment_lit(uv, w_view, to_world, lod);
 }

@@ -30,6 +30,7 @@ QUICK = {
     ("lpca", "cloth", "bright-texel"),
     ("cmf", "sphere", "bright-texel"),
     ("rf_poly", "plane", "bright-texel"),
+    ("rf_lobes", "sphere", "bright-texel"),
 }
 
 
@@ -38,21 +39,9 @@ def _renderers(need):
     need("llvm"), need("gl")
 
 
-#: Known misses, with their relative RMSE: a small light through prefiltered lobes.
-MISSES = {
-    ("rf_lobes", scene, "bright-texel"): "4.8 % on a plane, 8.6 % on a sphere, 7.3 % on a cloth"
-    for scene in SCENES
-}
-
-
 def cell(key, scene, environment):
     """A cell of the matrix, long unless quick."""
     marks = [] if (key, scene, environment) in QUICK else [pytest.mark.long]
-    if (key, scene, environment) in MISSES:
-        # A failed gate is what is known; a crash, or a reference that is too noisy to tell, is not.
-        marks.append(
-            pytest.mark.xfail(reason=MISSES[key, scene, environment], raises=AssertionError, strict=True)
-        )
     return pytest.param(key, scene, environment, marks=marks, id=f"{key}-{scene}-{environment}")
 
 
