@@ -58,7 +58,7 @@ class LightSet:
         return len(self.w)
 
     def table(self):
-        """For ``shaders/lib/environment_lights.glsl``: direction, then power; float32 (n, 2, 4); a black one if n = 0."""
+        """For ``shaders/lib/environment_lights.glsl``: direction, then power; float32 (n ≥ 1, 2, 4)."""
         table = np.zeros((max(len(self), 1), 2, 4), np.float32)
         table[: len(self), 0, :3], table[: len(self), 1, :3] = self.w, self.power
         return table

@@ -35,7 +35,7 @@ def probe(rep, uv, w_light, w_view, lod=0.0, *, filter_type=None):
     if not len(points):
         return np.zeros((0, 3), np.float32)
     with probe_points(rep, points, filter_type=filter_type) as made:
-        made.run(uniforms)
+        made.run()
         return made.values()
 
 
@@ -95,10 +95,15 @@ def probe_environment(rep, light, uv, w_view, to_world, *, filter_type=None):
     points = np.concatenate([np.asarray(uv, np.float32), np.asarray(w_view, np.float32), axes], 1)
     names = {"uv": 2, "w_view": 3, "axis_x": 3, "axis_y": 3, "axis_z": 3}
     tables = gl.ShaderRepresentation.upload(gl.context(), rep, filter_type=filter_type, light=light)
-    host = "hosts/probe_environment.vert"
-    results = [_transformed(tables, host, names, points, {**values}) for values in light.passes]
-    tables.release()
-    return sum(results[1:], results[0])
+    if not len(points):
+        tables.release()
+        return np.zeros((0, 3), np.float32)
+    with Probe(tables, "hosts/probe_environment.vert", names, points) as made:
+        total = 0
+        for values in light.passes:
+            made.run(values)
+            total = total + made.values()
+        return total
 
 
 class Probe:
@@ -165,15 +170,6 @@ def probe_points(rep, points, *, filter_type=None, result=("value", 3)):
     names = {"uv": 2, "w_light": 3, "w_view": 3, "lod": 1}
     tables = gl.ShaderRepresentation.upload(gl.context(), rep, filter_type=filter_type)
     return Probe(tables, "hosts/probe.vert", names, points, result)
-
-
-def _transformed(tables, host, names, points, uniforms=None):
-    """``value`` of a vertex host for rows of attributes."""
-    if not len(points):
-        return np.zeros((0, 3), np.float32)
-    with Probe(tables, host, names, points) as made:
-        made.run(uniforms)
-        return made.values()
 
 
 def broadcast_points(uv, w_light, w_view, lod=0.0):
