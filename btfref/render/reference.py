@@ -14,6 +14,7 @@ from btfref.errors import BtfrefError, InputError
 from btfref.render import parsing
 from btfref.render.camera import film_rays, grid_offsets, tell_camera
 from btfref.render.result import RenderResult
+from btfref.sampling.variant import no_collection
 
 #: Independent renders whose spread gives the variance of the mean: 15 degrees of freedom.
 BATCHES = 16
@@ -118,6 +119,7 @@ def render(
     return found
 
 
+@no_collection()
 def traced(made, *, spp=None, seed=0, noise_free=None, shadows=True, with_variance=False, grid=None):
     """A picture of a scene that is `loaded`; further ones cost no loading.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from contextlib import contextmanager
 
 from btfref.errors import InputError
@@ -44,3 +45,19 @@ def mitsuba_variant(variant):
     finally:
         if previous is not None:
             mi.set_variant(previous)
+
+
+@contextmanager
+def no_collection():
+    """Keep Python's cyclic garbage while a block traces kernels.
+
+    Dr.Jit lists all materials that exist and then calls them one after the other. A material in Python can start a
+    collection, which frees those of scenes that nobody holds any longer: their turn would then be a crash.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()

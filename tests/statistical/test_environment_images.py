@@ -4,6 +4,8 @@ The gates are equivalence tests: a noisy reference is inconclusive, never a pass
 the pictures, and the same sub-pixel positions, so that what is left is the approximation.
 """
 
+import gc
+
 import numpy as np
 import pytest
 
@@ -102,6 +104,21 @@ def test_the_reference_without_shadows_is_unbiased(fits):
     z = (image - shadowed.image)[inside] / np.sqrt(variance + shadowed.variance)[inside]
     assert np.abs(z).mean() < 1.0
     assert abs(z.mean()) * np.sqrt(z.size) < 5
+
+
+def test_no_garbage_is_collected_while_kernels_are_traced(fits, monkeypatch):
+    """A material in Python that a collection frees in the middle of Dr.Jit's list of materials is a crash."""
+    from btfref.render import reference
+
+    seen, once = [], reference._monte_carlo
+    monkeypatch.setattr(
+        reference, "_monte_carlo", lambda *arguments: seen.append(gc.isenabled()) or once(*arguments)
+    )
+    parameters = {"btf": str(fits.path("rf_poly")), "lights": "constant"}
+    assert gc.isenabled()
+    render(scene_file("plane"), parameters=parameters, spp=2, size=(4, 4))
+    assert seen == [False]
+    assert gc.isenabled()
 
 
 def test_tiles_have_three_outcomes(rng):
