@@ -18,6 +18,9 @@ from btfref.errors import InputError
 #: Least margin of directions, radians: renderers round.
 MARGIN = 1e-4
 
+#: Levels of detail by which a footprint may be off.
+LEVEL_MARGIN = 0.01
+
 
 @dataclass(frozen=True, eq=False)
 class Demand:
@@ -80,6 +83,10 @@ class Demand:
         if not all(mask.any() for mask in masks):
             raise InputError("the scene needs nothing of this BTF", file=self.file, field="demand")
         return Part(*(tuple(np.flatnonzero(mask).tolist()) for mask in masks))
+
+    def first_level(self, total):
+        """Finest of ``total`` levels of detail that is needed; a little finer than found, since renderers round."""
+        return int(np.clip(np.floor(self.least_lod - LEVEL_MARGIN), 0, total - 1))
 
     def shares(self):
         """Needed and whole numbers by what they count: views, lights, pairs, texels, samples, and further maps.
@@ -156,8 +163,8 @@ def demand(
     return {name: collector.demand(from_everywhere, indirect) for name, collector in wanted.items()}
 
 
-def kept_directions(scene, parameters=None, *, lights=True, **settings):
-    """Directions whose maps a scene needs, as :func:`btfref.representations.load` takes them.
+def kept_maps(scene, parameters=None, *, lights=True, **settings):
+    """The maps that a scene needs, as :func:`btfref.representations.load` takes them.
 
     Parameters
     ----------
@@ -169,22 +176,38 @@ def kept_directions(scene, parameters=None, *, lights=True, **settings):
     Returns
     -------
     dict of str to dict
-        By file: "views" and "lights", arrays of int, or None where the method keeps no maps by that direction.
+        By file: "views", "lights", "entries", "levels": arrays of int, or None where the method keeps no maps by them.
     """
+    return {
+        file: choice(one, lights=lights)
+        for file, one in demand(scene, parameters=parameters, **settings).items()
+    }
+
+
+def choice(one, *, lights=True):
+    """What to keep of the file of a :class:`Demand`; see :func:`kept_maps`."""
     from btfref.registry import method
-    from btfref.representations.container import read_info
+    from btfref.representations.container import read_info, read_maps
     from btfref.representations.resident import KINDS
 
-    result = {}
-    for file, one in demand(scene, parameters=parameters, **settings).items():
-        made = method(read_info(file)["method"], file=file).representation
-        chosen = {"views": one.views, "lights": one.lights if lights else None}
-        for kind, axes in KINDS.items():
-            mask = chosen[f"{kind}s"]
-            known = mask is not None and mask.any() and getattr(made, axes, {})
-            chosen[f"{kind}s"] = np.flatnonzero(mask) if known else None
-        result[file] = chosen
-    return result
+    file = one.file
+    made = method(read_info(file)["method"], file=file).representation
+    chosen = {"views": one.views, "lights": one.lights if lights else None}
+    for kind, axes in KINDS.items():
+        mask = chosen[f"{kind}s"]
+        known = mask is not None and mask.any() and getattr(made, axes, {})
+        chosen[f"{kind}s"] = np.flatnonzero(mask) if known else None
+    names = getattr(made, "ENTRIES", None)
+    chosen["entries"], chosen["levels"] = None, None
+    if names is not None and one.texels.any():
+        arrays, meta = read_maps(file, lambda name: name == names.index)
+        if "resident_entries" not in meta:
+            chosen["entries"] = np.unique(arrays[names.index][one.texels])
+    if getattr(made, "LEVELS", None) is not None:
+        _, meta = read_maps(file, lambda name: False)
+        total = len(meta["levels"])
+        chosen["levels"] = np.arange(one.first_level(total), total)
+    return chosen
 
 
 def maps_needed(demanded, representation):
@@ -204,7 +227,7 @@ def maps_needed(demanded, representation):
     maps = {}
     if hasattr(representation, "max_lod"):
         total = int(representation.max_lod) + 1
-        maps["levels"] = total - int(np.clip(np.floor(demanded.least_lod), 0, total - 1)), total
+        maps["levels"] = total - demanded.first_level(total), total
     for name, array in representation.arrays().items():
         if array.dtype == np.uint32 and array.shape[:2] == demanded.texels.shape and array.ndim == 3:
             used = np.unique(array[demanded.texels])
@@ -216,19 +239,22 @@ class _Collector:
     """Gathers what lookups of one BTF touch."""
 
     def __init__(self, file, shape, margin):
+        #: Representation whose lookups read texels elsewhere than at their coordinates.
+        self.surface = None
         if shape is None:
             from btfref.numerics import interpolation
-            from btfref.representations import load
+            from btfref.registry import method
+            from btfref.representations.container import load, read_maps
 
-            representation = load(file)
-            arrays, self.size = representation.arrays(), tuple(representation.meta["texels"])
+            arrays, meta = read_maps(file, lambda name: name.startswith(("view_", "light_")))
+            self.size = tuple(meta["texels"])
             self.tables = [interpolation.from_arrays(arrays, kind) for kind in ("view", "light")]
-            counts = [representation.meta[f"{kind}s"]["count"] for kind in ("view", "light")]
-            self.filter_type = representation.meta["filter_type"]
+            counts = [meta[f"{kind}s"]["count"] for kind in ("view", "light")]
+            if hasattr(method(meta["method"], file=file).representation, "seen_texels"):
+                self.surface = load(file)
         else:
             views, lights, self.size = shape
             self.tables, counts = [views.interpolation, lights.interpolation], [len(views), len(lights)]
-            self.filter_type = "bilinear"
         # Kept views are indices of their own: here, those of the whole count.
         self.tables = [getattr(table, "inner", table) for table in self.tables]
         self.file, self.margin = file, margin
@@ -251,7 +277,7 @@ class _Collector:
         uv = np.array(si.uv, float).T[seen][front] @ affine[:, :2].T + affine[:, 2]
         w_view = w_view[front]
         self.views[self._touched(self.tables[0], w_view)] = True
-        self._touch_texels(uv)
+        self._touch_texels(uv, w_view)
         if material.lod == "auto" and material.lod_bias == 0:
             self._touch_levels(si, seen, front, material, footprint)
         else:
@@ -283,10 +309,16 @@ class _Collector:
             found.append(np.unique(index[weight > 0]))
         return np.unique(np.concatenate(found))
 
-    def _touch_texels(self, uv):
-        index, _ = texel_stencil(uv, self.size, "bilinear")
+    def _touch_texels(self, uv, w_view):
         there = np.zeros(self.size, bool)
-        there.reshape(-1)[np.unique(index)] = True
+        if self.surface is None:
+            index, _ = texel_stencil(uv, self.size, "bilinear")
+            there.reshape(-1)[np.unique(index)] = True
+        else:
+            # A ray that is a little off may pass a silhouette and see another place.
+            for shift in MARGIN * np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]):
+                index = self.surface.seen_texels(uv, _upper(w_view + shift))
+                there.reshape(-1)[np.unique(index)] = True
         for rows in (-1, 0, 1):
             for columns in (-1, 0, 1):
                 self.texels |= np.roll(there, (rows, columns), (0, 1))

@@ -96,6 +96,8 @@ def make_bsdf():
         views      string    indices of the measured views to keep, such as "0 3 17"; default: all. A lookup that needs
                              another one gives no number
         lights     string    likewise of the lights
+        entries    string    likewise of the entries that texels name: clusters, materials
+        levels     string    likewise of the levels of detail
         lod        string    level of detail: "auto" (default), by the pixel's footprint; "distance", log2 of it; "none"
         lod_bias   float     added to the level of detail, so that "none" with a bias is a fixed level; default 0
         lod_unit   float     distance whose level of detail is 0 in mode "distance", > 0; default 1
@@ -118,6 +120,8 @@ def make_bsdf():
                 str(mi.file_resolver().resolve(str(self.filename))),
                 views=_indices(props, "views"),
                 lights=_indices(props, "lights"),
+                entries=_indices(props, "entries"),
+                levels=_indices(props, "levels"),
             )
             own = representation.meta["filter_type"]
             self.filter_type = _choice(props, "filter_type", own, FILTER_TYPES)

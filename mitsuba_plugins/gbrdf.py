@@ -58,8 +58,10 @@ class Evaluator:
         stencil = bilinear_stencil(facet, self.ndf.n)
         diffuse, gloss = mi.Color3f(0), mi.Color3f(0)
         for texel, weight in texels:
-            red, green, blue, r0 = dr.gather(mi.Vector4f, self.colour, texel, active)
-            material, amount, _, _ = dr.gather(mi.Vector4f, self.gloss, texel, active)
+            # Not fetched without weight: a texel whose material is not kept holds no numbers.
+            here = active & (weight > 0)
+            red, green, blue, r0 = dr.gather(mi.Vector4f, self.colour, texel, here)
+            material, amount, _, _ = dr.gather(mi.Vector4f, self.gloss, texel, here)
             diffuse += weight * mi.Color3f(red, green, blue)
             share = weight * amount * dr.fma(1 - r0, fifth, r0)
             gloss += share * self.ndf.lookup(mi.UInt32(material), stencil, active)

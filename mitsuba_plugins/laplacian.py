@@ -68,8 +68,12 @@ class Evaluator:
         self.edges = constants["light_edge"], constants["view_edge"]
         self.n_levels, self.max_lod = int(constants["n_levels"]), float(constants["max_lod"])
         levels = maps.meta["levels"][: self.n_levels]
+        # Tables begin with the finest level that is kept.
+        self.first_level = int(constants.get("first_level", 0))
+        self.base = min(self.first_level, self.n_levels - 1)
         self.shapes = [(level["rows"], level["columns"]) for level in levels]
         first = np.cumsum([0, *(r * c for r, c in self.shapes)])[:-1]
+        first = np.maximum(first - first[self.base], 0)
         self.sizes = mi.UInt32(
             np.array([[r, c, f, 0] for (r, c), f in zip(self.shapes, first, strict=True)]).ravel()
         )
@@ -101,13 +105,18 @@ class Evaluator:
         lod = dr.minimum(dr.select(mi.Float(lod) > 0, lod, 0), self.max_lod)
         total = self._mean(w_light, w_view, views, lights, active)
         along = uv, step, ratio
+        finest = 1.0
+        if self.first_level:
+            # A level that is not kept gives no number, and is not fetched.
+            finest = dr.select(lod < self.first_level, dr.nan, 1)
+            lod = dr.maximum(lod, self.first_level)
         if self.differentiable:
             # Gradients do not reach variables that a loop captures.
-            for k in range(self.n_levels):
+            for k in range(self.base, self.n_levels):
                 total = self._with_level(
                     total, mi.UInt32(k), along, views, lights, lod, active & (lod < k + 1)
                 )
-            return _rgb(total.value())
+            return _rgb(total.value()) * finest
 
         def body(level, total):
             here = active & (level < self.n_levels)
@@ -119,7 +128,7 @@ class Evaluator:
             body,
             label="levels",
         )
-        return _rgb(total.value())
+        return _rgb(total.value()) * finest
 
     def _with_level(self, total, level, along, views, lights, lod, active):
         """The sum in Y, Cb, Cr with a level."""
@@ -155,7 +164,7 @@ class Evaluator:
             _, coefficient = dr.while_loop(
                 (-reach, coefficient), lambda j, coefficient: active & (j <= reach), body, label="probes"
             )
-        return self.basis.combine(level, views, lights, coefficient, active, total)
+        return self.basis.combine(level - self.base, views, lights, coefficient, active, total)
 
     def _mean(self, w_light, w_view, views, lights, active):
         """The mean of the coarsest level in Y, Cb, Cr."""

@@ -30,6 +30,8 @@ class Evaluator:
 
     def _texel(self, texel, share, active):
         """Cluster of a texel and the coefficients of its mean and components, times ``share``."""
+        # Not fetched without weight: a texel whose cluster is not kept holds no numbers.
+        active = active & (share > 0)
         cluster = dr.gather(mi.UInt32, self.cluster, texel * self.cluster_stride, active)
         weights = read_packets(self.weights, texel, self.width, active)[: self.n_components]
         return cluster, [mi.Float(share), *(mi.Float(w) * share for w in weights)]

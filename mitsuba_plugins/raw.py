@@ -28,5 +28,6 @@ class Evaluator:
         views, lights = self.views.stencil(w_view), self.lights.stencil(w_light, hold=False)
         total = mi.Color3f(0)
         for texel, weight in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True):
-            total += self.values.combine(texel, views, lights, [weight], active)
+            # Texels without weight are not fetched: they may not be there.
+            total += self.values.combine(texel, views, lights, [weight], active & (weight > 0))
         return total

@@ -61,7 +61,8 @@ class PairTable:
         self.words, self.values = None, None
         packable = dr.type_v(values.array) == dr.VarType.Float16 and not dr.grad_enabled(values.array)
         halves = values.numpy() if packable else None
-        if not packable or np.abs(halves).max() > HALF_LIMIT:
+        # Moved bits make a number of NaN, which stands for what is not there: such tables stay as they are.
+        if not packable or not np.abs(halves).max() <= HALF_LIMIT:
             self.values = wide(values)
             return
         halves = (halves * np.float16(HALF_SHIFT)).view(np.uint16)

@@ -157,7 +157,7 @@ def synthesis(folder, quick, progress):
 def scenes(folder, btf, quick, progress):
     """What each shipped scene needs, and what its maps then cost to keep, to load and to look up."""
     from btfref.bench.data import checker
-    from btfref.demand import demand, kept_directions, maps_needed
+    from btfref.demand import demand, kept_maps, maps_needed
     from btfref.registry import method
     from btfref.representations import load, save
     from btfref.scenes import scene_file
@@ -180,7 +180,7 @@ def scenes(folder, btf, quick, progress):
                 parameters = fixed | step | {"btf": str(path)}
                 (some,) = demand(file, parameters=parameters, grid=2, size=size).values()
                 one = some if one is None else one | some
-            (kept,) = kept_directions(file, fixed | steps[0] | {"btf": str(path)}, grid=2, size=size).values()
+            (kept,) = kept_maps(file, fixed | steps[0] | {"btf": str(path)}, grid=2, size=size).values()
             kept = {
                 kind: None if chosen is None else np.flatnonzero(getattr(one, kind))
                 for kind, chosen in kept.items()

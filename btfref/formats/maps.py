@@ -43,7 +43,8 @@ def export_maps(path, out):
     they fit. Indices are written as floats.
     """
     from btfref.formats.pictures import write_exr
-    from btfref.representations.container import image_size, load
+    from btfref.representations.container import load
+    from btfref.representations.map_images import image_size
 
     representation = load(path)
     row = method(representation.meta["method"])

@@ -13,7 +13,7 @@ import time
 import numpy as np
 
 from btfref import representations
-from btfref.demand import MARGIN, kept_directions
+from btfref.demand import MARGIN, kept_maps
 from btfref.errors import BtfrefError, InputError
 from btfref.render import gl
 from btfref.render.lighting import lighting_of
@@ -48,8 +48,8 @@ def realtime(
     size : (int, int), optional
         Width and height in place of the scene's.
     views : {"all", "needed"}
-        "needed" keeps only the maps of those measured views in memory that the camera can see; the picture is the
-        same. Asks Mitsuba for the camera's rays; not for a `SceneDescription`.
+        "needed" keeps only the maps in memory that the camera's first hits need: views, lights, levels of detail,
+        entries of codebooks; the picture is the same. Asks Mitsuba for the camera's rays; not for a `SceneDescription`.
     environment : str
         Way in which the scene's environment lights: see :class:`btfref.render.lighting.Lighting`.
     lights : int, optional
@@ -89,7 +89,7 @@ def realtime(
     if views == "needed":
         if isinstance(scene, SceneDescription):
             raise InputError("the views that are needed follow from a scene file", field="views", got=views)
-        needed = kept_directions(scene, parameters, grid=grid, size=size, margin=MARGIN)
+        needed = kept_maps(scene, parameters, grid=grid, size=size, margin=MARGIN)
     if not isinstance(scene, SceneDescription):
         scene = read_scene(scene, parameters, size=size)
 
@@ -120,6 +120,8 @@ def realtime(
             "environment": scene.environment.name if scene.environment else None,
             "resident_views": _count(needed, "views"),
             "resident_lights": _count(needed, "lights"),
+            "resident_entries": _count(needed, "entries"),
+            "resident_levels": _count(needed, "levels"),
             **renderer.environment_facts,
             **gl.facts(renderer.ctx),
         }
@@ -129,7 +131,7 @@ def realtime(
     if needed and meta["not_finite"]:
         # Views that are not there give no number: such a picture is not handed out.
         raise BtfrefError(
-            f"{meta['not_finite']} channels needed views that were not kept; render with all views"
+            f"{meta['not_finite']} channels needed maps that were not kept; render with all views"
         )
     return RenderResult(image, None, meta)
 

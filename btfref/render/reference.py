@@ -64,8 +64,8 @@ def render(
         light, so that environments are possible; always with a variance, and with ``meta["batches"]``, four
         independent pictures, float32 (4, H, W, 3).
     maps : {"all", "needed"}
-        "needed" loads the maps of those views alone that the cameras' first hits need, and without noise those of the
-        lights as well, of methods that keep maps by direction: the same picture bit by bit. ``meta["maps"]`` says how
+        "needed" loads the maps of those views, levels of detail and entries of codebooks alone that the cameras' first
+        hits need, and without noise those of the lights as well: the same picture bit by bit. ``meta["maps"]`` says how
         many, by file.
     debug : bool
         A channel that is no number is an error. ``meta["not_finite"]`` counts them in any case: lookups outside of what
@@ -92,10 +92,10 @@ def render(
         raise InputError("unknown choice of maps", field="maps", got=maps, expected="all or needed")
     kept = {}
     if maps == "needed":
-        from btfref.demand import MARGIN, kept_directions
+        from btfref.demand import MARGIN, kept_maps
 
         lit = noise_free is not None
-        kept = kept_directions(
+        kept = kept_maps(
             scene, parameters, lights=lit, grid=noise_free or 4, size=size, margin=MARGIN if lit else None
         )
     with loaded(scene, parameters, variant=variant, size=size, kept=kept) as made:
@@ -167,7 +167,7 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
     """``with loaded(scene, parameters, variant=…, size=…) as mitsuba_scene``; restores the variant.
 
     ``plain`` loads the shapes alone: materials become diffuse, and BTF files need not exist. ``kept`` says which
-    directions' maps are loaded: file to the materials' parameters ``views`` and ``lights``.
+    maps are loaded: file to the materials' parameters ``views``, ``lights``, ``entries`` and ``levels``.
     """
 
     def __init__(self, scene, parameters=None, *, variant="llvm_ad_rgb", size=None, plain=False, kept=None):

@@ -13,6 +13,7 @@ largest albedo of the distribution, because one of integral 1 may reflect up to 
 from __future__ import annotations
 
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from btfref.numerics.parabolic import bilinear_stencil
 from btfref.numerics.precision import computing_in, real
 from btfref.representations.guide import group_means, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points
+from btfref.representations.resident import Entries, refuse_absent
 
 #: Tiles by which a port's hit may differ from the definition's: float32 positions at the far end of the longest ray.
 HIT_TOLERANCE = 2e-6
@@ -50,6 +52,8 @@ class Representation(StoredMaps):
     which only guide sampling.
     """
 
+    ENTRIES: ClassVar = Entries("material", {"ndf": 0, "specular": 0}, "fresnel")
+
     @classmethod
     def from_arrays(cls, arrays, meta):
         """The representation whose :meth:`arrays` and ``meta`` these are; derived constants are made anew."""
@@ -71,7 +75,8 @@ class Representation(StoredMaps):
         # The bound is convex in r0, so that lines between its values at nodes lie above it.
         nodes = np.linspace(0, 1, _FRESNEL_NODES)
         table = specular_albedo_bound(self.maps["ndf"], nodes)
-        place = self.maps["fresnel"][..., 0].astype(float) * (_FRESNEL_NODES - 1)
+        # Not a number where the material is not kept.
+        place = np.nan_to_num(self.maps["fresnel"][..., 0].astype(float)) * (_FRESNEL_NODES - 1)
         low = np.minimum(place.astype(int), _FRESNEL_NODES - 2)
         t = place - low
         bound = (1 - t) * table[material, low] + t * table[material, low + 1]
@@ -104,6 +109,10 @@ class Representation(StoredMaps):
 
         kept = {"ndf", *(name for name in self.maps if name.startswith(("view_", "light_")))}
         return self.port_tables | packed_arrays({name: self.maps[name] for name in kept})
+
+    def seen_texels(self, uv, w_view):
+        """Texels that lookups blend, where view rays meet the surface: flat indices, shape (N, 2), (N, 3) -> (N, T)."""
+        return texel_weights(self.field.view_hits(uv, w_view), self.field.shape, self.meta["filter_type"])[0]
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored. Never negative."""
@@ -173,6 +182,8 @@ class Representation(StoredMaps):
             return value
         index, weight, cos_light = index[lit], weight[lit], cos_light[lit]
         colour = real(flat["colour"][index])
+        if self.meta.get("partial", False):
+            colour = refuse_absent(colour, weight, "entries")
         diffuse = np.einsum("nt,ntc->nc", weight, colour[..., :3]) * (cos_light / np.pi)[:, None]
         h = w_light[lit] + w_view[lit]
         length = np.linalg.norm(h, axis=-1, keepdims=True)
@@ -195,6 +206,10 @@ class Representation(StoredMaps):
 
         The plugin looks the group up where the view ray hits.
         """
+        if self.meta.get("partial", False):
+            # What is not there guides as if it had no gloss at the normal.
+            there = self.maps | {"fresnel": np.nan_to_num(self.maps["fresnel"])}
+            return type(self)(there, self.meta | {"partial": False}).sampling_tables()
         rows, columns = self.field.shape
         views, lights = (self.maps[f"{kind}_directions"].astype(float) for kind in ("view", "light"))
         some = lights[np.unique(np.linspace(0, len(lights) - 1, min(24, len(lights))).round().astype(int))]

@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from btfref.conventions import texel_stencil
+from btfref.errors import InputError
 from btfref.numerics import interpolation
 from btfref.numerics.phong import phong
 from btfref.numerics.precision import real
@@ -28,6 +29,13 @@ class Representation(StoredMaps):
 
     VIEW_AXES: ClassVar = {"basis_*": 0, "mean": 0}
     LIGHT_AXES: ClassVar = {"basis_*": 1, "mean": 1}
+    LEVELS: ClassVar = ("basis_*", "weights_*")
+    ROWS_BY: ClassVar = {"basis_*": (0,), "mean": (0,)}
+
+    @property
+    def first_level(self):
+        """Finest level that is kept."""
+        return self.meta["constants"].get("first_level", 0)
 
     @property
     def max_lod(self):
@@ -55,6 +63,8 @@ class Representation(StoredMaps):
             lod = clamped_lod(lod, len(levels))
             for k, share in enumerate(level_weights(lod, len(levels))):
                 used = np.flatnonzero(lod < k + 1)
+                if len(used) and k < self.first_level:
+                    raise InputError("a lookup needs levels that are not resident", field="levels", got=k)
                 if f"basis_{k}" not in self.maps or not len(used):
                     continue
                 total[used] += share[used, None] * self._level(
@@ -114,8 +124,8 @@ class Representation(StoredMaps):
     def port_arrays(self):
         """Two tables of entries of one length, so that ports can loop over levels.
 
-        ``basis`` [level, view, light, component] and ``weights`` [texels of all levels, component], of the levels that
-        have components; each channel padded with zeros to its largest number of components.
+        ``basis`` [level, view, light, component] and ``weights`` [texels of all levels, component], of the kept levels
+        that have components; each channel padded with zeros to its largest number of components.
         """
         constants = self.meta["constants"]
         most = [constants[f"n_{name}"] for name in ("y", "cb", "cr")]
@@ -126,16 +136,19 @@ class Representation(StoredMaps):
             if name.startswith("basis_"):
                 # Of fewer directions where some are not kept.
                 n_views, n_lights, kind = *table.shape[:2], table.dtype
-        levels = self.meta["levels"][: constants["n_levels"]]
+        first_level = min(self.first_level, constants["n_levels"] - 1)
+        levels = self.meta["levels"][first_level : constants["n_levels"]]
         basis = np.zeros((len(levels), n_views, n_lights, first[-1]), kind)
         weights = []
         for k, level in enumerate(levels):
+            number = first_level + k
             ends = np.cumsum([0, *level["components"]])
             weights.append(np.zeros((level["rows"] * level["columns"], first[-1]), kind))
             for start, a, b in zip(first, ends, ends[1:], strict=False):
-                if b > a:
-                    basis[k, ..., start : start + b - a] = self.maps[f"basis_{k}"][..., a:b]
-                    own = self.maps[f"weights_{k}"][..., a:b]
+                # Of levels that are not kept, one stands there with zeros where no coarser one has components.
+                if b > a and f"basis_{number}" in self.maps:
+                    basis[k, ..., start : start + b - a] = self.maps[f"basis_{number}"][..., a:b]
+                    own = self.maps[f"weights_{number}"][..., a:b]
                     weights[k][:, start : start + b - a] = own.reshape(-1, b - a)
         others = {name: a for name, a in self.maps.items() if not name.startswith(("basis_", "weights_"))}
         return packed_arrays({**others, "basis": basis, "weights": np.concatenate(weights)})
@@ -154,7 +167,7 @@ class Representation(StoredMaps):
         tables = [self._luminance_mean()[None]]
         for k in range(level, len(self.meta["levels"])):
             n = self.meta["levels"][k]["components"][0]
-            if not n:
+            if not n or k < self.first_level:
                 continue
             weights = self.maps[f"weights_{k}"][..., :n].astype(np.float32)
             weights = expand_image(weights, shape, self.meta["filter_type"])

@@ -27,6 +27,7 @@ from btfref.representations.lookup import (
     positive_integer,
     stored,
 )
+from btfref.representations.resident import Entries, refuse_absent
 
 #: "paper": the setting of the 2004 paper's timings, 16 clusters with a mean and 4 components, in floats.
 PRESETS = {"paper": {"clusters": 16, "components": 4, "storage": "float"}}
@@ -48,6 +49,8 @@ class Representation(StoredMaps):
 
     VIEW_AXES: ClassVar = {"basis": 2}
     LIGHT_AXES: ClassVar = {"basis": 3}
+    ENTRIES: ClassVar = Entries("cluster", {"basis": 0}, "weights")
+    ROWS_BY: ClassVar = {"basis": (0, 2)}
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored.
@@ -59,8 +62,13 @@ class Representation(StoredMaps):
         weights = self.maps["weights"].reshape(len(cluster), -1)
         coefficient = real(np.concatenate([np.ones((len(weights), 1)), weights], 1))
 
+        partial = self.meta.get("partial", False)
+
         def kernel(s):
-            texel_coefficient = s.texel_weight[:, :, None] * coefficient[s.texel]
+            own = coefficient[s.texel]
+            if partial:
+                own = refuse_absent(own, s.texel_weight, "entries")
+            texel_coefficient = s.texel_weight[:, :, None] * own
             index = (
                 cluster[s.texel][:, :, None, None],
                 slice(None),
@@ -93,14 +101,16 @@ class Representation(StoredMaps):
             ``B_x = Σ_m coefficient[x, m] tables[cluster[x], m]``; the first one is 1.
         """
         cluster = self.maps["cluster"].reshape(-1).astype(np.int64)
-        weights = self.maps["weights"].reshape(len(cluster), -1).astype(float)
+        # Of texels that are not there no table is known: what ports read of them is not a number.
+        weights = np.nan_to_num(self.maps["weights"].reshape(len(cluster), -1).astype(float))
         return self.maps["basis"], cluster, np.concatenate([np.ones((len(weights), 1)), weights], 1)
 
     def sampling_tables(self):
         """Groups of texels alike, and their means."""
         basis = conventions.luminance(self.maps["basis"].astype(np.float32))
         cluster = self.maps["cluster"].reshape(-1)
-        weights = self.maps["weights"].reshape(len(cluster), -1).astype(np.float32)
+        # Of what is not there the mean alone guides sampling.
+        weights = np.nan_to_num(self.maps["weights"].reshape(len(cluster), -1).astype(np.float32))
         n_clusters, n_colours = basis.shape[:2]
         # Coefficients over all clusters' colours, zero outside of the texel's own.
         coefficient = np.zeros((len(cluster), n_clusters, n_colours), np.float32)

@@ -1,13 +1,19 @@
-"""Representations of which only some views or lights are kept: maps that a scene cannot ask for need no memory.
+"""Representations of which only a part is kept: maps that a scene cannot ask for need no memory.
 
 A method says which axis of which map runs over views and over lights (``VIEW_AXES`` and ``LIGHT_AXES`` of its class;
 ``*`` stands for any text). The directions stay what they are, and with them every interpolation weight; a table of
-slots takes a direction to its place in the shortened maps. A lookup that needs one which is not there is an error in
-NumPy and not a number in the ports, never another direction's value.
+slots takes a direction to its place in the shortened maps.
+
+Where texels name entries of codebooks (clusters, materials), ``ENTRIES`` of the class says which map holds the names,
+which axis of which map runs over the entries, and which map of numbers a lookup of a texel always reads: of texels
+whose entry is not kept it becomes NaN. Where maps are those of levels of detail, ``LEVELS`` says how they are called.
+
+A lookup that needs what is not there is an error in NumPy and not a number in the ports, never another value.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
 import numpy as np
@@ -17,6 +23,25 @@ from btfref.numerics.interpolation import MISSING
 
 #: Kinds of directions: what their maps' axes are called in a class, and in the meta of a selection.
 KINDS = {"view": "VIEW_AXES", "light": "LIGHT_AXES"}
+
+
+@dataclass(frozen=True)
+class Entries:
+    """How texels name entries of codebooks.
+
+    Attributes
+    ----------
+    index : str
+        Map of names, uint32 [row, column, 1].
+    axes : dict of str to int
+        Maps, and their axis that runs over the entries.
+    mark : str
+        Map [row, column, …] of floats that every lookup of a texel reads.
+    """
+
+    index: str
+    axes: dict
+    mark: str
 
 
 def slots_name(kind):
@@ -33,22 +58,23 @@ def with_views(representation, views):
     return keeping(representation, views=views)
 
 
-def keeping(representation, *, views=None, lights=None):
-    """The representation with the maps of some views and lights only.
+def keeping(representation, **choice):
+    """The representation with the maps of some views, lights, entries and levels only.
 
     Parameters
     ----------
     representation : Representation
         Its class has ``VIEW_AXES`` (for ``views``) and ``LIGHT_AXES`` (for ``lights``): names of maps and the axis that
-        runs over these directions.
-    views, lights : array_like of int, optional
+        runs over these directions. For ``entries`` it has ``ENTRIES``, for ``levels`` ``LEVELS``.
+    views, lights, entries : array_like of int, optional
         Indices of those to keep, in any order, at least one; None for all.
+    levels : array_like of int, optional
+        Likewise; the coarsest one and those next to it, since a lookup needs all from its own on.
 
     Returns
     -------
     Representation
-        Equal values wherever only these are interpolated. ``meta["resident_views"]`` and ``meta["resident_lights"]``
-        list them.
+        Equal values wherever only these are read. ``meta["resident_views"]`` and so on list them.
 
     Raises
     ------
@@ -57,12 +83,16 @@ def keeping(representation, *, views=None, lights=None):
         some.
     """
     made = type(representation)
-    arrays, meta = select(representation.arrays(), representation.meta, made, views=views, lights=lights)
+    arrays, meta = select(representation.arrays(), representation.meta, made, **choice)
     return made.from_arrays(arrays, meta)
 
 
-def select(arrays, meta, made, *, views=None, lights=None, file=None):
-    """Arrays and meta of class ``made`` with the chosen directions; see :func:`keeping`."""
+def select(arrays, meta, made, *, views=None, lights=None, entries=None, levels=None, file=None):
+    """Arrays and meta of class ``made`` with what was chosen; see :func:`keeping`."""
+    if entries is not None:
+        arrays, meta = _with_entries(arrays, meta, made, entries, file)
+    if levels is not None:
+        arrays, meta = _with_levels(arrays, meta, made, levels, file)
     for kind, chosen in (("view", views), ("light", lights)):
         if chosen is not None:
             if meta.get("constants", {}).get("nearest_directions"):
@@ -89,6 +119,114 @@ def axes_of(made, method, kind="view", *, file=None):
     return axes
 
 
+def _with_entries(arrays, meta, made, entries, file):
+    names = entries_of(made, meta["method"], file=file)
+    sizes = [arrays[name].shape[axis] for name, axis in names.axes.items()]
+    if "resident_entries" in meta:
+        raise InputError("entries are chosen already", file=file, field="entries", got=meta["method"])
+    kept = _checked("entries", entries, sizes[0], file)
+    slots = slots_of(sizes[0], kept)
+    place = slots[:, 0][arrays[names.index]]
+    lost = place == MISSING
+    mark = np.where(lost, np.array(np.nan, arrays[names.mark].dtype), arrays[names.mark])
+    result = {**arrays, names.index: np.where(lost, np.uint32(0), place), names.mark: mark}
+    for name, axis in names.axes.items():
+        result[name] = np.ascontiguousarray(np.take(arrays[name], kept, axis))
+    return result, {**meta, "resident_entries": kept.tolist(), "partial": bool(lost.any())}
+
+
+def _with_levels(arrays, meta, made, levels, file):
+    patterns = levels_of(made, meta["method"], file=file)
+    total = len(meta["levels"])
+    kept = _checked("levels", levels, total, file)
+    if kept[-1] != total - 1 or len(kept) != total - kept[0]:
+        raise InputError(
+            "levels of detail are needed from one on",
+            file=file,
+            field="levels",
+            got=", ".join(map(str, kept)),
+            expected=f"all up to {total - 1}",
+        )
+    first = int(kept[0])
+    if first < meta["constants"].get("first_level", 0):
+        raise InputError("a level is not there", file=file, field="levels", got=first)
+    gone = {pattern.replace("*", str(k)) for pattern in patterns for k in range(first)}
+    result = {name: array for name, array in arrays.items() if name not in gone}
+    constants = meta["constants"] | {"first_level": first}
+    return result, {**meta, "constants": constants, "resident_levels": kept.tolist()}
+
+
+def entries_of(made, method, *, file=None):
+    """``ENTRIES`` of a class of representations.
+
+    Raises
+    ------
+    InputError
+        When it has none.
+    """
+    return _attribute(made, "ENTRIES", "entries that texels name", "entries", method, file)
+
+
+def levels_of(made, method, *, file=None):
+    """``LEVELS`` of a class of representations.
+
+    Raises
+    ------
+    InputError
+        When it has none.
+    """
+    return _attribute(made, "LEVELS", "levels of detail", "levels", method, file)
+
+
+def _attribute(made, name, what, field, method, file):
+    found = getattr(made, name, None)
+    if not found:
+        raise InputError(f"the method has no {what}", file=file, field=field, got=method)
+    return found
+
+
+def needed_rows(made, manifest, choice):
+    """Which maps of a file a choice needs, and of which indices along the axes that are rows there.
+
+    Parameters
+    ----------
+    made : type
+        Class of the representation.
+    manifest : dict
+        Of the file: ``meta`` and ``arrays`` with the shapes.
+    choice : dict
+        As for :func:`keeping`.
+
+    Returns
+    -------
+    dict of str to dict of int to array
+        By map the indices of each axis that has some alone; a map that is not there is not needed.
+    """
+    meta, result = manifest["meta"], {}
+    chosen = {kind: choice.get(f"{kind}s") for kind in KINDS}
+    gone = set()
+    if choice.get("levels") is not None and len(choice["levels"]):
+        levels = range(int(np.min(choice["levels"])))
+        gone = {p.replace("*", str(k)) for p in levels_of(made, meta["method"]) for k in levels}
+    for name in manifest["arrays"]:
+        if name in gone:
+            continue
+        axes = {}
+        for kind, indices in chosen.items():
+            # Of a file that holds some directions alone, indices are not places.
+            if indices is None or slots_name(kind) in manifest["arrays"]:
+                continue
+            for pattern, axis in getattr(made, KINDS[kind], {}).items():
+                if fnmatchcase(name, pattern):
+                    axes[axis] = np.asarray(indices, np.int64)
+        if choice.get("entries") is not None:
+            axis = entries_of(made, meta["method"]).axes.get(name)
+            if axis is not None:
+                axes[axis] = np.asarray(choice["entries"], np.int64)
+        result[name] = axes
+    return result
+
+
 def slots_of(total, kept):
     """Table that takes each of ``total`` directions to its place among the sorted ``kept`` ones."""
     table = np.full((total, 1), MISSING, np.uint32)
@@ -97,11 +235,8 @@ def slots_of(total, kept):
 
 
 def _selected(arrays, meta, axes, kind, chosen, file):
-    chosen = np.unique(np.asarray(chosen, np.int64))
     field, total = f"{kind}s", meta[f"{kind}s"]["count"]
-    if not len(chosen) or chosen[0] < 0 or chosen[-1] >= total:
-        got = f"{chosen.min(initial=0)} … {chosen.max(initial=0)}" if len(chosen) else "none"
-        raise InputError(f"no such {field}", file=file, field=field, got=got, expected=f"0 … {total - 1}")
+    chosen = _checked(field, chosen, total, file)
     slots = np.arange(total)
     if slots_name(kind) in arrays:
         slots = arrays[slots_name(kind)][:, 0].astype(np.int64)
@@ -118,3 +253,33 @@ def _selected(arrays, meta, axes, kind, chosen, file):
         result[name] = array if axis is None else np.ascontiguousarray(np.take(array, kept, axis))
     result[slots_name(kind)] = slots_of(total, chosen)
     return result, {**meta, f"resident_{field}": chosen.tolist()}
+
+
+def _checked(field, chosen, total, file):
+    """Sorted indices, at least one, all below ``total``."""
+    chosen = np.unique(np.asarray(chosen, np.int64))
+    if not len(chosen) or chosen[0] < 0 or chosen[-1] >= total:
+        got = f"{chosen.min(initial=0)} … {chosen.max(initial=0)}" if len(chosen) else "none"
+        raise InputError(f"no such {field}", file=file, field=field, got=got, expected=f"0 … {total - 1}")
+    return chosen
+
+
+def refuse_absent(values, weight, field):
+    """``values`` with 0 where the weight is 0; NaN elsewhere marks texels whose entry is not kept.
+
+    Parameters
+    ----------
+    values : ndarray, shape (..., k)
+    weight : ndarray, shape (...)
+    field : str
+        For the message.
+
+    Raises
+    ------
+    InputError
+        When a lookup needs one of them.
+    """
+    values = np.where((weight > 0)[..., None], values, 0)
+    if np.isnan(values).any():
+        raise InputError(f"a lookup needs {field} that are not resident", field=field)
+    return values

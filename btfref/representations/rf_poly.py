@@ -38,6 +38,7 @@ class Representation(analytic.AnalyticMaps):
 
     #: Maps by view; see :mod:`btfref.representations.resident`.
     VIEW_AXES: ClassVar = {"polynomial": 2}
+    ROWS_BY: ClassVar = {"polynomial": (2,)}
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored.

@@ -33,6 +33,7 @@ class Representation(StoredMaps):
 
     VIEW_AXES: ClassVar = {"basis": 1}
     LIGHT_AXES: ClassVar = {"basis": 2}
+    ROWS_BY: ClassVar = {"basis": (1,)}
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored.

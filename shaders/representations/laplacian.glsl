@@ -16,6 +16,12 @@ uniform sampler2DArray phong;
 uniform sampler2DArray mean;
 #endif
 
+// Tables begin with the finest level that is kept; a lookup of a finer one gives no number.
+#ifndef FIRST_LEVEL
+#define FIRST_LEVEL 0
+#endif
+const int BASE_LEVEL = FIRST_LEVEL < N_LEVELS ? FIRST_LEVEL : N_LEVELS - 1;
+
 const int LEVEL_ROW_TABLE[N_LEVELS] = LEVEL_ROWS;
 const int LEVEL_COLUMN_TABLE[N_LEVELS] = LEVEL_COLUMNS;
 const int LEVEL_FIRST_TABLE[N_LEVELS] = LEVEL_FIRST;
@@ -80,7 +86,7 @@ CarefulSum with_level(CarefulSum sum, int level, float share, vec2 uv, Stencil v
         texels.weight *= probe_weight(j);
         for (int x = 0; x < 4; ++x) {
             if (texels.weight[x] != 0.0) {
-                int at = (LEVEL_FIRST_TABLE[level] + texels.index[x]) * BASIS_STRIDE;
+                int at = (LEVEL_FIRST_TABLE[level] - LEVEL_FIRST_TABLE[BASE_LEVEL] + texels.index[x]) * BASIS_STRIDE;
                 for (int i = 0; i < BASIS_STRIDE; ++i) {
                     coefficient[i] += texels.weight[x] * table_fetch(weights, at + i);
                 }
@@ -91,7 +97,7 @@ CarefulSum with_level(CarefulSum sum, int level, float share, vec2 uv, Stencil v
         for (int l = 0; l < 4; ++l) {
             float weight = share * views.weight[v] * lights.weight[l];
             if (weight != 0.0) {
-                int at = ((level * BASIS_DIM1 + views.index[v]) * BASIS_DIM2 + lights.index[l]) * BASIS_STRIDE;
+                int at = (((level - BASE_LEVEL) * BASIS_DIM1 + views.index[v]) * BASIS_DIM2 + lights.index[l]) * BASIS_STRIDE;
                 vec3 pair = vec3(0.0);
                 for (int i = 0; i < BASIS_STRIDE; ++i) {
                     pair += channel_sum(4 * i, coefficient[i] * table_fetch(basis, at + i));
@@ -109,6 +115,11 @@ vec3 btf_eval(vec2 uv, vec3 w_light, vec3 w_view, float lod) {
     }
     // A lod that is no number fails the comparison.
     lod = lod > 0.0 ? min(lod, MAX_LOD) : 0.0;
+#if FIRST_LEVEL > 0
+    if (lod < float(FIRST_LEVEL)) {
+        return vec3(uintBitsToFloat(0x7fc00000u));
+    }
+#endif
     Stencil views = direction_choice(view_stencil(w_view));
     Stencil lights = direction_choice(light_stencil(w_light));
     CarefulSum sum = with_mean(CarefulSum(vec3(0.0), vec3(0.0)), w_light, w_view, views, lights);

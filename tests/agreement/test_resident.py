@@ -8,13 +8,16 @@ import pytest
 from probes import hemisphere
 
 from btfref.cli import main
+from btfref.conventions import texel_stencil
 from btfref.errors import InputError
 from btfref.numerics import interpolation
 from btfref.registry import methods
 from btfref.render.probe import probe
 from btfref.render.realtime import realtime
 from btfref.representations import load, save
-from btfref.representations.resident import KINDS, SLOTS, with_views
+from btfref.representations.exr_rows import RowReader
+from btfref.representations.gbrdf import texel_weights
+from btfref.representations.resident import KINDS, SLOTS, keeping, with_views
 
 CASES = [
     (key, kind)
@@ -73,6 +76,140 @@ def test_kept_directions_give_the_same_numbers_and_others_none(need, fits, llvm,
     values = [np.array(p.eval(llvm.BSDFContext(), si, llvm.Vector3f(points[1].T))).T for p in parts]
     np.testing.assert_array_equal(values[1][enough], values[0][enough])
     assert np.isnan(values[1][~enough]).all()
+
+
+def values_of(llvm, path, points, lod=None, **more):
+    """B by the plugin, float32 (N, 3)."""
+    import drjit as dr
+
+    import mitsuba_plugins
+
+    mitsuba_plugins.register()
+    text = {name: " ".join(map(str, indices)) for name, indices in more.items()}
+    level = {} if lod is None else {"lod": "none", "lod_bias": lod}
+    plugin = llvm.load_dict({"type": "btf", "filename": str(path), **text, **level})
+    si = dr.zeros(llvm.SurfaceInteraction3f, len(points[0]))
+    si.uv, si.wi = llvm.Point2f(points[0].T), llvm.Vector3f(points[2].T)
+    return np.array(plugin.eval(llvm.BSDFContext(), si, llvm.Vector3f(points[1].T))).T
+
+
+@pytest.mark.parametrize("filter_type", ["bilinear", "nearest"])
+@pytest.mark.parametrize("key", ["lpca", "gbrdf"])
+def test_kept_entries_give_the_same_numbers_and_others_none(
+    need, fits, llvm, rng, tmp_path, key, filter_type
+):
+    need("gl")
+    fitted = fits(key)
+    names = type(fitted).ENTRIES
+    maps = dict(fitted.maps)
+    if key == "gbrdf":
+        # As many materials as there are clusters, in stripes.
+        count = 4
+        maps["material"] = np.broadcast_to(
+            (np.arange(maps["material"].shape[1]) * count // maps["material"].shape[1])[None, :, None],
+            maps["material"].shape,
+        ).astype(np.uint32)
+        maps |= {name: np.resize(maps[name], (count, *maps[name].shape[1:])) for name in names.axes}
+    whole = fitted.from_arrays(maps, fitted.meta | {"filter_type": filter_type})
+    path = tmp_path / f"whole.{key}.exr"
+    save(whole, path)
+    total = len(maps[next(iter(names.axes))])
+    chosen = np.arange(0, total, 2)
+    some = load(path, entries=chosen)
+    assert all(some.maps[name].shape[axis] == len(chosen) for name, axis in names.axes.items())
+    uv, _, w_view = points = (
+        rng.uniform(size=(3000, 2)).astype(np.float32), hemisphere(rng, 3000), hemisphere(rng, 3000)
+    )  # fmt: skip
+    if key == "gbrdf":
+        index, weight = texel_weights(whole.field.view_hits(uv, w_view), whole.field.shape, filter_type)
+    else:
+        index, weight = texel_stencil(uv, whole.meta["texels"], filter_type)
+    there = np.isin(maps[names.index].reshape(-1)[index], chosen)
+    inside, outside = (there | (weight == 0)).all(1), (~there & (weight > 1e-3)).any(1)
+    assert min(inside.mean(), outside.mean()) > 0.1
+    expected = whole.evaluate(*points)
+    np.testing.assert_array_equal(some.evaluate(*(a[inside] for a in points)), expected[inside])
+    lit = outside & (expected > 0).any(1)
+    with pytest.raises(InputError, match="entries that are not resident"):
+        some.evaluate(*(a[lit] for a in points))
+    pairs = (
+        (probe(some, *points), probe(whole, *points)),
+        (values_of(llvm, path, points, entries=chosen), values_of(llvm, path, points)),
+    )
+    for found, full in pairs:
+        # Where a ray passes a silhouette, a port may see another texel than the definition.
+        same = (found == full).all(1)
+        lost = np.isnan(found).all(1)
+        assert (same | lost).all()
+        assert same[inside].mean() > 0.99
+        assert lost[lit].mean() > 0.99
+    again = tmp_path / f"some.{key}.exr"
+    save(some, again)
+    np.testing.assert_array_equal(probe(load(again), *points), pairs[0][0])
+    with pytest.raises(InputError, match="chosen already"):
+        load(again, entries=[0])
+    with pytest.raises(InputError, match="no such entries"):
+        load(path, entries=[total])
+    with pytest.raises(InputError, match="no entries"):
+        load(fits.path("svd"), entries=[0])
+
+
+def test_kept_levels_give_the_same_numbers_and_finer_ones_none(need, fits, llvm, rng):
+    need("gl")
+    whole, path = fits("laplacian"), fits.path("laplacian")
+    total = len(whole.meta["levels"])
+    points = rng.uniform(size=(500, 2)).astype(np.float32), hemisphere(rng, 500), hemisphere(rng, 500)
+    for first in (1, total - 1):
+        some = load(path, levels=np.arange(first, total))
+        assert not any(name in some.maps for name in ("basis_0", "weights_0"))
+        assert some.port_arrays()["weights"].size < whole.port_arrays()["weights"].size
+        for lod in (first, min(first + 0.3, total - 1), total + 2.0):
+            for evaluate in (
+                lambda rep, lod: rep.evaluate(*points, lod=lod), lambda rep, lod: probe(rep, *points, lod)
+            ):  # fmt: skip
+                np.testing.assert_array_equal(evaluate(some, lod), evaluate(whole, lod))
+            found = values_of(llvm, path, points, lod, levels=np.arange(first, total))
+            np.testing.assert_array_equal(found, values_of(llvm, path, points, lod))
+        with pytest.raises(InputError, match="levels that are not resident"):
+            some.evaluate(*points, lod=first - 0.1)
+        assert np.isnan(probe(some, *points, first - 0.1)).all()
+        assert np.isnan(values_of(llvm, path, points, first - 0.1, levels=np.arange(first, total))).all()
+        assert np.isfinite(some.sampling_tables()[1]).all()
+    for levels, message in (([0], "from one on"), ([total], "no such levels"), ([], "no such levels")):
+        with pytest.raises(InputError, match=message):
+            load(path, levels=levels)
+    with pytest.raises(InputError, match="no levels"):
+        load(fits.path("raw"), levels=[0])
+
+
+def test_only_what_is_kept_is_read(fits, tmp_path, monkeypatch):
+    """Rows and parts of their own are read alone, give the same maps, and damage elsewhere is not noticed."""
+    read = []
+    leave = RowReader.__exit__
+    monkeypatch.setattr(
+        RowReader, "__exit__", lambda self, *error: (read.append(self.bytes_read), leave(self, *error))[1]
+    )
+    choices = {
+        "lpca": {"entries": [1], "views": range(5)}, "svd": {"views": [3, 4]}, "rf_lobes": {"views": range(6)},
+        "rf_poly": {"views": [80]}, "laplacian": {"levels": [4]},
+    }  # fmt: skip
+    for key, choice in choices.items():
+        path = fits.path(key)
+        whole = keeping(load(path), **choice)
+        read.clear()
+        some = load(path, **choice)
+        assert len(read) == 1
+        assert read[0] < 0.6 * path.stat().st_size
+        assert some.meta == whole.meta
+        assert list(some.maps) == list(whole.maps)
+        for name, array in whole.maps.items():
+            np.testing.assert_array_equal(some.maps[name], array)
+    spoiled = tmp_path / "spoiled.rf_lobes.exr"
+    content = bytearray(fits.path("rf_lobes").read_bytes())
+    for n in (100, len(content) // 3, len(content) - 10):
+        spoiled.write_bytes(content[:n])
+        with pytest.raises(InputError, match=r"truncated|missing|damaged"):
+            load(spoiled, views=[80])
 
 
 def test_a_selection_is_stored_and_selected_again(fits, tmp_path):

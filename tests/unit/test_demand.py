@@ -152,6 +152,19 @@ def test_pictures_are_equal_bit_by_bit(need, fits, one_light):
         assert kept["views"] < 40
         assert kept["lights"] <= 6
         assert some.meta["not_finite"] == 0
+    # Levels of a far plane, materials of a height field's hits, views alone.
+    for key, tiling in (("laplacian", "40"), ("gbrdf", "3"), ("rf_lobes", "3")):
+        parameters = one_light | {"btf": str(fits.path(key)), "tiling": tiling}
+        for pictures in (
+            [
+                render(PLANE, parameters=parameters, noise_free=2, size=SIZE, maps=m)
+                for m in ("all", "needed")
+            ],
+            [realtime(PLANE, parameters=parameters, grid=2, size=SIZE, views=m) for m in ("all", "needed")],
+        ):
+            np.testing.assert_array_equal(pictures[1].image, pictures[0].image)
+        if key == "laplacian":
+            assert max(pictures[1].meta["resident_levels"].values()) < len(fits(key).meta["levels"])
     fast = [
         realtime(PLANE, parameters=one_light, grid=1, size=SIZE, views=views) for views in ("all", "needed")
     ]
@@ -190,8 +203,7 @@ def test_a_store_of_what_is_needed(need, tmp_path, one_light):
         load(paths["part"]).evaluate([0.2, 0.3], spherical(1.2, 3.0), spherical(1.2, 3.0))
 
 
-def test_missing_tiles_are_no_numbers(need, tmp_path):
-    need("llvm")
+def test_missing_tiles_are_no_numbers(llvm, tmp_path):
     settings = {"texels": (8, 70), "views": "10x5", "lights": [[0, 0, 1]], "spp": 2}
     part = Part(views=tuple(range(15)), tiles=(1,))
     store = synthesize_store(tmp_path / "part.btf.zarr", "checker", only=part, **settings)
@@ -206,6 +218,16 @@ def test_missing_tiles_are_no_numbers(need, tmp_path):
     with pytest.raises(InputError, match="not resident"):
         again.evaluate([67.5 / 70, 0.3], up, store.views.vectors[40])
     assert np.isfinite(again.sampling_tables()[1]).all()
+    import mitsuba_plugins
+
+    mitsuba_plugins.register()
+    plugin = llvm.load_dict({"type": "btf", "filename": str(tmp_path / "part.raw.exr")})
+    si = llvm.SurfaceInteraction3f()
+    si.wi = llvm.Vector3f(view)
+    for u, known in ((20, False), (67.5, True)):
+        si.uv = llvm.Point2f(u / 70, 0.3)
+        value = np.array(plugin.eval(llvm.BSDFContext(), si, llvm.Vector3f(up)))
+        assert np.isfinite(value).all() == known
 
 
 def test_commands(need, tmp_path, capsys, fits):

@@ -1,0 +1,213 @@
+"""Some parts, and some rows, of a multi-part OpenEXR file: what is not asked for is neither read nor decompressed.
+
+The OpenEXR library's binding reads whole files. Scan lines stand in chunks that are found through a table of offsets
+(OpenEXR file layout, "Multi-Part, Scan Line"); a chunk of ZIP or ZIPS is 16 lines or one, deflated after its bytes were
+split into even and odd ones and each replaced by its difference to the one before.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from btfref.errors import InputError
+
+#: Lines of a chunk by code of the compression: none, ZIPS, ZIP.
+LINES = {0: 1, 2: 1, 3: 16}
+
+#: Types of pixels by their code.
+TYPES = {0: np.dtype("<u4"), 1: np.dtype("<f2"), 2: np.dtype("<f4")}
+
+_MULTI_PART = 0x1000
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What the header of a part says: channels in the order of the file, and where its chunks begin."""
+
+    channels: list
+    kind: np.dtype
+    compression: int
+    rows: int
+    columns: int
+    chunks: int
+    offsets: int
+
+    @property
+    def lines(self):
+        """Scan lines of a chunk."""
+        return LINES[self.compression]
+
+
+class RowReader:
+    """An OpenEXR file of which parts and rows are read one by one; a context manager.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Attributes
+    ----------
+    bytes_read : int
+        Of headers, tables and chunks so far.
+
+    Raises
+    ------
+    InputError
+        For a damaged or truncated file.
+    """
+
+    def __init__(self, path):
+        self.path, self.bytes_read = Path(path), 0
+        self._stream = self.path.open("rb")
+        try:
+            self._parts = self._headers()
+        except BaseException:
+            self._stream.close()
+            raise
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._stream.close()
+
+    def knows(self, name):
+        """Whether a part is there, of scan lines in a compression that is read here."""
+        part = self._parts.get(name)
+        return part is not None and part.compression in LINES and part.kind is not None
+
+    def read(self, name, channels, rows=None):
+        """Pixels of a part.
+
+        Parameters
+        ----------
+        name : str
+        channels : list of str
+            In the order of the result.
+        rows : array_like of int, optional
+            Rows to read, in any order; default all. Others of their chunks may be filled too.
+
+        Returns
+        -------
+        ndarray, shape (rows, columns, channels)
+            Rows that were not read are 0.
+
+        Raises
+        ------
+        InputError
+            For channels that are not there, and damaged or truncated files.
+        """
+        part = self._parts[name]
+        if sorted(channels) != part.channels:
+            raise InputError(
+                "a map is damaged", file=self.path, field=name, got=f"channels {', '.join(part.channels)}"
+            )
+        place = [part.channels.index(channel) for channel in channels]
+        wanted = np.arange(part.chunks) if rows is None else np.unique(np.asarray(rows) // part.lines)
+        self._stream.seek(part.offsets)
+        table = np.frombuffer(self._take(8 * part.chunks), "<u8")
+        result = np.zeros((part.rows, part.columns, len(channels)), part.kind)
+        line = part.columns * len(channels) * part.kind.itemsize
+        for chunk in wanted:
+            first = int(chunk) * part.lines
+            count = min(part.lines, part.rows - first)
+            self._stream.seek(int(table[chunk]))
+            _, row, size = struct.unpack("<iii", self._take(12))
+            if row != first or not 0 <= size <= count * line:
+                raise self._damaged(f"chunk {chunk} of {name}")
+            data = self._take(size)
+            data = np.frombuffer(
+                data if size == count * line else self._inflated(data, count * line), np.uint8
+            )
+            # Of each line one channel after the other.
+            pixels = data.view(part.kind).reshape(count, len(channels), part.columns)
+            result[first : first + count] = np.moveaxis(pixels[:, place], 1, -1)
+        return result
+
+    def _inflated(self, data, size):
+        try:
+            found = np.frombuffer(zlib.decompress(data), np.uint8)
+        except zlib.error as error:
+            raise self._damaged(str(error)) from None
+        if len(found) != size:
+            raise self._damaged("a chunk of another length")
+        steps = found - np.uint8(128)
+        steps[0] = found[0]
+        whole = np.cumsum(steps, dtype=np.uint8)
+        result = np.zeros_like(whole)
+        half = (size + 1) // 2
+        result[0::2], result[1::2] = whole[:half], whole[half:]
+        return result
+
+    def _take(self, n):
+        data = self._stream.read(n)
+        if len(data) != n:
+            raise self._damaged("its end is missing")
+        self.bytes_read += n
+        return data
+
+    def _text(self):
+        letters = bytearray()
+        while (letter := self._take(1)) != b"\0":
+            letters += letter
+            if len(letters) > 255:
+                raise self._damaged("a name without end")
+        return letters.decode("utf-8", "replace")
+
+    def _headers(self):
+        """Parts by name."""
+        _, version = struct.unpack("<ii", self._take(8))
+        headers = []
+        while True:
+            header = {}
+            while name := self._text():
+                self._text()
+                (size,) = struct.unpack("<i", self._take(4))
+                if size < 0:
+                    raise self._damaged(f"attribute {name}")
+                header[name] = self._take(size)
+            if not header:
+                break
+            headers.append(header)
+            if not version & _MULTI_PART:
+                break
+        parts, offset = {}, self._stream.tell()
+        for header in headers:
+            try:
+                low_x, low_y, high_x, high_y = struct.unpack("<iiii", header["dataWindow"])
+                compression, channels = header["compression"][0], _channels(header["channels"])
+            except (KeyError, struct.error, IndexError, ValueError):
+                raise self._damaged("a header") from None
+            rows, columns = high_y - low_y + 1, high_x - low_x + 1
+            lines = LINES.get(compression, 1)
+            chunks = (
+                struct.unpack("<i", header["chunkCount"])[0] if "chunkCount" in header else -(-rows // lines)
+            )
+            kinds = {kind for _, kind in channels}
+            simple = (
+                len(kinds) == 1 and low_y == 0 and header.get("type", b"scanlineimage") == b"scanlineimage"
+            )
+            kind = TYPES.get(kinds.pop()) if simple else None
+            name = header.get("name", b"").rstrip(b"\0").decode("utf-8", "replace")
+            parts[name] = _Part([c for c, _ in channels], kind, compression, rows, columns, chunks, offset)
+            offset += 8 * chunks
+        return parts
+
+    def _damaged(self, what):
+        return InputError(f"damaged or truncated OpenEXR file: {what}", file=self.path)
+
+
+def _channels(data):
+    """Names and types of a list of channels."""
+    result, at = [], 0
+    while data[at] != 0:
+        end = data.index(b"\0", at)
+        (kind,) = struct.unpack_from("<i", data, end + 1)
+        result.append((data[at:end].decode("utf-8", "replace"), kind))
+        at = end + 17
+    return result
