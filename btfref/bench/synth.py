@@ -20,16 +20,11 @@ import numpy as np
 from btfref.bench.data import MESOSTRUCTURES
 from btfref.bench.timing import machine
 
-#: Label -> estimator and samples. Errors stand beside the times: equal samples are not equal errors.
-METHODS = {
-    "naive 16": ("naive", 16),
-    "naive 64": ("naive", 64),
-    "path 16": ("path", 16),
-    "path 64": ("path", 64),
-    "surface 10": ("surface", 10),
-    "surface 20": ("surface", 20),
-    "surface 40": ("surface", 40),
-}
+#: Samples of the naive loop and of paths.
+SAMPLES = (16, 64)
+
+#: Surface points a texel for about the errors of these samples. Errors stand beside the times.
+POINTS = {"checker": (10, 30), "rings": (25, 80), "tissue": (18, 60)}
 
 #: Growth of the cost: what is varied -> its values. The others stay at `BASE`.
 GROWTH = {
@@ -74,7 +69,7 @@ def run(*, quick=False, progress=None, only=None, btf=None):
     rounds, texels = (1, 16) if quick else (3, 64)
     result = {"raw": {}, "errors": {}, "peak_bytes": {}, "kernel_s": {}}
     settings = _growing(quick) if growing else []
-    total, done = len(names) * (1 + rounds * len(METHODS)) + len(settings), 0
+    total, done = len(names) * (1 + rounds * 3 * len(SAMPLES)) + len(settings), 0
     with tempfile.TemporaryDirectory() as folder:
         for name in names:
             reference = Path(folder) / f"{name}.npz"
@@ -82,7 +77,7 @@ def run(*, quick=False, progress=None, only=None, btf=None):
             done += 1
             raw, errors, peak, kernels = {}, {}, {}, {}
             for seed in range(rounds):
-                for label, (method, spp) in METHODS.items():
+                for label, (method, spp) in methods(name).items():
                     job = {"task": method, "mesostructure": name, "texels": texels, "spp": spp, "seed": seed}
                     answer = _child(job | {"reference": str(reference)})
                     raw.setdefault(label, []).append(answer["seconds"])
@@ -112,6 +107,12 @@ def run(*, quick=False, progress=None, only=None, btf=None):
         "naive_pairs": NAIVE_PAIRS,
     }
     return {"suite": "synth", "parameters": parameters, "machine": machine(), **result}
+
+
+def methods(name):
+    """Label -> estimator and samples, for one mesostructure."""
+    spp = {"naive": SAMPLES, "path": SAMPLES, "surface": POINTS[name]}
+    return {f"{key} {count}": (key, count) for key, counts in spp.items() for count in counts}
 
 
 def _growing(quick):
@@ -337,8 +338,9 @@ def _task(job):
             btf = None
             views = vectors[used[:4]] if warm and path else vectors[used]
             start = time.perf_counter()
+            # Images alone, as the naive loop makes them.
             btf = synthesize(job["mesostructure"], views=views, lights=vectors, seed=job["seed"],
-                             dtype="float32", **settings)  # fmt: skip
+                             dtype="float32", variance=False, **settings)  # fmt: skip
             seconds = (time.perf_counter() - start) * len(vectors) / len(views)
         values = btf.values[np.searchsorted(used, chosen[:, 0]), chosen[:, 1]]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
@@ -349,6 +351,7 @@ def _task(job):
 
 def _growth(job):
     """Time and memory of one setting, results not kept: what a store would be given view by view."""
+    import gc
     import resource
     import time
 
@@ -360,11 +363,15 @@ def _growth(job):
     vectors = directions(job["directions"]).vectors
     tile = build(job["mesostructure"])
     with mitsuba_variant("llvm_ad_rgb"):
-        for texels in (16, job["texels"]):
+        for _ in range(2):
+            # The first run compiles kernels, whose constants are those of this setting. Its BSDFs must be gone
+            # before the second one starts: two scenes are other kernels.
+            estimator = None
+            gc.collect()
             start = time.perf_counter()
             estimator = SurfaceEstimator(
-                tile, vectors, views=vectors, texels=(texels, texels), spp=job["spp"], seed=0,
-                max_depth=job["max_depth"],
+                tile, vectors, views=vectors, texels=(job["texels"],) * 2, spp=job["spp"], seed=0,
+                max_depth=job["max_depth"], variance=False,
             )  # fmt: skip
             for _ in estimator.all_views(range(len(vectors))):
                 pass

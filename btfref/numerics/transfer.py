@@ -62,3 +62,42 @@ def in_one_kernel(width, scatters):
 
     once = dr.opaque(mi.UInt32, 1)
     dr.while_loop((dr.zeros(mi.UInt32, width),), lambda k: k < once, step)
+
+
+def packed(values):
+    """Numbers of each lane side by side, so that one lookup of four costs about what one number costs alone.
+
+    Parameters
+    ----------
+    values : list of Float
+        A multiple of four, of one width; single numbers as well.
+
+    Returns
+    -------
+    Float
+        [lane, value].
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    width, count = max(map(dr.width, values)), len(values)
+    result = dr.empty(mi.Float, width * count)
+    dr.eval(values)
+    lane = dr.arange(mi.UInt32, width)
+
+    def write():
+        for k, value in enumerate(values):
+            dr.scatter(result, value, lane * count + k)
+
+    in_one_kernel(width, write)
+    dr.eval(result)
+    return result
+
+
+def unpacked(table, index, count, active=True):
+    """The numbers of some lanes of `packed`: a list of ``count``."""
+    import drjit as dr
+    import mitsuba as mi
+
+    fours = [dr.gather(mi.Array4f, table, index * (count // 4) + k, active) for k in range(count // 4)]
+    return [four[k] for four in fours for k in range(4)]

@@ -169,7 +169,14 @@ class BroadLobes:
 
     def eval_rest(self, bsdf, index, albedo, si, wo, active):
         """The rest times cosine of ``wo``."""
-        value = bsdf.eval(self.drawn, si, wo, active)
+        return self._less_broad(bsdf.eval(self.drawn, si, wo, active), index, albedo, si, wo)
+
+    def eval_pdf_rest(self, bsdf, index, albedo, si, wo, active):
+        """`eval_rest` and `pdf_rest` for the price of little more than one."""
+        value, pdf = bsdf.eval_pdf(self.drawn, si, wo, active)
+        return self._less_broad(value, index, albedo, si, wo), pdf
+
+    def _less_broad(self, value, index, albedo, si, wo):
         return value - self.value(index, albedo, si.wi, wo) if self.any and not self.masked else value
 
     def pdf_rest(self, bsdf, si, wo, active):

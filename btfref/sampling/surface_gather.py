@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.numerics.transfer import in_one_kernel, to_device
+from btfref.numerics.transfer import in_one_kernel, packed, to_device, unpacked
 from btfref.sampling.surface_points import starts
 
 #: Lights that one lane serves.
@@ -180,19 +180,10 @@ def _packets(scene, surface, rows, bins):
     wi = mi.Frame3f(s, dr.cross(shading, s), mi.Normal3f(shading)).to_local(w)
     uv = dr.gather(mi.Point2f, surface.uv, record)
     weight, part = (np.concatenate([getattr(some, name) for some in bins]) for name in ("weight", "part"))
-    lane = dr.arange(mi.UInt32, len(weight))
-    packets = dr.empty(mi.Float, 16 * len(weight))
     numbers, records = (mi.Float(dr.reinterpret_array(mi.Float, a)) for a in (number, record))
     weight, part = to_device(mi.Float, weight), to_device(mi.Float, part)
-    values = (*s, uv.x, *shading, uv.y, *wi, scene.lobes.shape(number, wi.z), part, numbers, records, weight)
-
-    def write():
-        for k, value in enumerate(values):
-            dr.scatter(packets, value, lane * 16 + k)
-
-    in_one_kernel(len(weight), write)
-    dr.eval(packets)
-    return packets
+    shape = scene.lobes.shape(number, wi.z)
+    return packed([*s, uv.x, *shading, uv.y, *wi, shape, part, numbers, records, weight])
 
 
 def _points(scene, surface, table, rows, bins, cell, first, variance):
@@ -217,22 +208,23 @@ def _points(scene, surface, table, rows, bins, cell, first, variance):
     context = lobes.drawn if lobes.exact else lobes.full
 
     def entry_values(entry):
-        e = [dr.gather(mi.Array4f, packets, entry * 4 + k) for k in range(4)]
+        e = unpacked(packets, entry, 16)
         si = dr.zeros(mi.SurfaceInteraction3f, width)
-        shading, s = mi.Vector3f(e[1].x, e[1].y, e[1].z), mi.Vector3f(e[0].x, e[0].y, e[0].z)
+        s, shading = mi.Vector3f(e[:3]), mi.Vector3f(e[4:7])
         si.sh_frame = mi.Frame3f(s, dr.cross(shading, s), mi.Normal3f(shading))
         si.n = si.sh_frame.n
-        si.uv = mi.Point2f(e[0].w, e[1].w)
-        si.wi = mi.Vector3f(e[2].x, e[2].y, e[2].z)
-        bsdf = dr.reinterpret_array(mi.BSDFPtr, dr.reinterpret_array(mi.UInt32, e[3].y))
-        record = dr.reinterpret_array(mi.UInt32, e[3].z)
+        si.uv = mi.Point2f(e[3], e[7])
+        si.wi = mi.Vector3f(e[8:11])
+        shape, part, weight = e[11], e[12], e[15]
+        bsdf = dr.reinterpret_array(mi.BSDFPtr, dr.reinterpret_array(mi.UInt32, e[13]))
+        record = dr.reinterpret_array(mi.UInt32, e[14])
         values = []
         for j in range(block):
             row = dr.gather(mi.Array4f, table, dr.fma(record, light_count, index[j]))
             # Zero where the light is hidden.
             direct = bsdf.eval(context, si, si.to_local(vectors[j]), row.w != 0)
-            values.append(dr.fma(mi.Color3f(row.x, row.y, row.z), e[2].w, direct * row.w))
-        return e[3].x, e[3].w, record, values
+            values.append(dr.fma(mi.Color3f(row.x, row.y, row.z), shape, direct * row.w))
+        return part, weight, record, values
 
     colours = tuple(mi.Color3f(zero) for _ in range(block))
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.numerics.transfer import to_device
+from btfref.numerics.transfer import packed, to_device, unpacked
 from btfref.sampling.surface_points import starts
 from btfref.sampling.surface_walks import Surface, connect, continue_walks
 from btfref.sampling.tiled_scene import rotated, stream_keys, uniforms
@@ -219,6 +219,10 @@ class TexelWalks:
         z = to_device(mi.Float, scene.directions[hits["direction"], 2])
         hits["power"] *= z / (cosine * 2 * self.per_half)
         hits["density"] *= cosine
+        #: Power, |n·ω| at the start, direction, density, weight.
+        self.what = packed(
+            [*hits["power"], hits["facing"], *incoming, hits["density"], *hits["weight"], mi.Float(0)]
+        )
         bright = dr.max(dr.abs(hits["power"])) > 0
         self.photons = dr.compress(bright)
         first = np.searchsorted(self.photons.numpy(), self.range)
@@ -254,9 +258,9 @@ class TexelWalks:
         def bring(i):
             i = dr.gather(mi.UInt32, at, i)
             si, bsdf, number, albedo = hits["surface"].interaction(i)
-            si.wi = si.to_local(dr.gather(mi.Vector3f, hits["wi"], i))
-            gain = share * dr.gather(mi.Color3f, hits["weight"], i)
-            facing, density = (dr.gather(mi.Float, hits[name], i) for name in ("facing", "density"))
+            e = unpacked(self.what, i, 12)
+            si.wi, gain = si.to_local(mi.Vector3f(e[4:7])), share * mi.Color3f(e[8:11])
+            facing, density = e[3], e[7]
 
             def from_light(w, k):
                 seen = cache.value(dr.gather(mi.UInt8, coded, dr.fma(i, n, k)))
@@ -333,14 +337,14 @@ class TexelWalks:
             i = dr.gather(mi.UInt32, self.photons, entry)
             seen = cache.value(dr.gather(mi.UInt8, hits["coded"], dr.fma(i, n, row)))
             si, bsdf, number, albedo = surface.interaction(i)
-            si.wi, incoming = si.to_local(w), si.to_local(dr.gather(mi.Vector3f, hits["wi"], i))
+            e = unpacked(self.what, i, 12)
+            si.wi, incoming = si.to_local(w), si.to_local(mi.Vector3f(e[4:7]))
             spread = dr.abs(dr.dot(si.n, w)) / w.z
-            facing, density = (dr.gather(mi.Float, hits[name], i) for name in ("facing", "density"))
-            value = lobes.eval_rest(bsdf, number, albedo, si, incoming, seen != 0)
-            other = spread * facing * lobes.pdf_rest(bsdf, si, incoming, seen != 0)
-            value *= density / dr.maximum(density + other, 1e-30)
+            facing, density = e[3], e[7]
+            value, pdf = lobes.eval_pdf_rest(bsdf, number, albedo, si, incoming, seen != 0)
+            value *= density / dr.maximum(density + spread * facing * pdf, 1e-30)
             value += lobes.value(number, albedo, si.wi, incoming)
-            value *= seen * spread * dr.gather(mi.Color3f, hits["power"], i)
+            value *= seen * spread * mi.Color3f(e[:3])
             p = si.p
             x, y = p.x - p.z * w.x / w.z, p.y - p.z * w.y / w.z
             column = dr.minimum(mi.UInt32((x - dr.floor(x)) * width), width - 1)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from btfref.numerics.transfer import in_one_kernel, to_device
+from btfref.numerics.transfer import in_one_kernel, packed, to_device, unpacked
 from btfref.sampling.path_estimator import ROULETTE_LIMIT, ROULETTE_VERTEX
 from btfref.sampling.tiled_scene import uniforms
 
@@ -30,6 +30,8 @@ class Surface:
         BSDF as Dr.Jit's number of it; 0 for the absorber.
     albedo : mitsuba.Color3f
         ρ of the broad lobe.
+    table : mitsuba.Float
+        All of these side by side, for lookups.
     """
 
     p: Any
@@ -39,6 +41,7 @@ class Surface:
     uv: Any
     number: Any
     albedo: Any
+    table: Any = None
 
     @classmethod
     def of_points(cls, points, lobes):
@@ -81,7 +84,27 @@ class Surface:
         si, bsdf, number, _ = self.interaction(None)
         self.albedo = lobes.albedo(bsdf, number, si)
         self.albedo += dr.zeros(type(self.albedo), dr.width(self.number))
-        dr.eval(*(getattr(self, name) for name in _FIELDS))
+        dr.eval(self._values())
+        return self._tabled()
+
+    def _tabled(self):
+        import drjit as dr
+        import mitsuba as mi
+
+        number = dr.reinterpret_array(mi.Float, self.number)
+        values = (
+            self.p,
+            self.uv.x,
+            self.n,
+            self.uv.y,
+            self.s,
+            number,
+            self.shading,
+            mi.Float(0),
+            self.albedo,
+            mi.Float(0),
+        )
+        self.table = packed([x for value in values for x in (value if dr.depth_v(value) > 1 else (value,))])
         return self
 
     def taken(self, index):
@@ -90,7 +113,7 @@ class Surface:
 
         parts = [dr.gather(type(value), value, index) for value in self._values()]
         dr.eval(*parts)
-        return Surface(*parts)
+        return Surface(*parts)._tabled()
 
     def joined(self, other):
         """These records and then the others."""
@@ -103,7 +126,7 @@ class Surface:
 
         parts = [both(a, b) for a, b in zip(self._values(), other._values(), strict=True)]
         dr.eval(*parts)
-        return Surface(*parts)
+        return Surface(*parts)._tabled()
 
     def _values(self):
         return [getattr(self, name) for name in _FIELDS]
@@ -113,10 +136,21 @@ class Surface:
         import drjit as dr
         import mitsuba as mi
 
-        values = self._values()
-        if index is not None:
-            values = [dr.gather(type(value), value, index, active) for value in values]
-        p, n, s, shading, uv, number, albedo = values
+        if index is None:
+            p, n, s, shading, uv, number, albedo = self._values()
+        else:
+            e = unpacked(self.table, index, 20, active)
+            p, n, s, shading = (
+                mi.Point3f(e[:3]),
+                mi.Vector3f(e[4:7]),
+                mi.Vector3f(e[8:11]),
+                mi.Vector3f(e[12:15]),
+            )
+            uv, number, albedo = (
+                mi.Point2f(e[3], e[7]),
+                dr.reinterpret_array(mi.UInt32, e[11]),
+                mi.Color3f(e[16:19]),
+            )
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
         si.p, si.n, si.uv, si.dp_du = p, mi.Normal3f(n), uv, s
         si.sh_frame = mi.Frame3f(s, dr.cross(shading, s), mi.Normal3f(shading))
@@ -300,8 +334,9 @@ def continue_walks(
             values = [lane, offset, mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Color3f(onward)]
             dr.eval(values, alive)
         coded = cache.sights(tiles, si, row, choice, towards=-direction)
-        vertices = (surface, mi.Vector3f(si.wi), share * weight, coded)
-        dr.eval(vertices[1:], offset)
+        dr.eval(offset)
+        what = packed([*si.wi, mi.Float(0), *(share * weight), mi.Float(0)])
+        vertices = surface, what, coded
         connect(
             lights, target, offset, _bringing(lobes, cache, vertices, first and broad_first), stride=stride
         )
@@ -314,12 +349,13 @@ def _bringing(lobes, cache, vertices, broad):
     import drjit as dr
     import mitsuba as mi
 
-    surface, wi, weight, coded = vertices
+    surface, what, coded = vertices
     n = dr.opaque(mi.UInt32, cache.n)
 
     def bring(i):
         si, bsdf, number, albedo = surface.interaction(i)
-        si.wi, gain = dr.gather(mi.Vector3f, wi, i), dr.gather(mi.Color3f, weight, i)
+        e = unpacked(what, i, 8)
+        si.wi, gain = mi.Vector3f(e[:3]), mi.Color3f(e[4:7])
 
         def from_light(w, row):
             seen = cache.value(dr.gather(mi.UInt8, coded, dr.fma(i, n, row)))
