@@ -73,7 +73,7 @@ def run(args):
 
 def lines(result):
     """The outcome for a reader: a row a method and mesostructure, what failed, what took how long."""
-    from btfref.validate.summary import HEADER, rows
+    from btfref.validate.summary import HEADER, additivity, rows
 
     yield from table(
         [[number(c) if isinstance(c, float) else c for c in row] for row in rows(result)], header=HEADER
@@ -82,9 +82,8 @@ def lines(result):
     for name, gate in result.failed_gates:
         yield f"{name}: {gate.line}"
     passed = sum(cell.outcome == "pass" for cell in result.cells)
-    additive = sum(bool((cell.facts["waterfall"] or {}).get("additive")) for cell in result.cells)
     yield (
-        f"{passed} of {len(result.cells)} cells pass; stages add up in {additive}, the others say why; "
+        f"{passed} of {len(result.cells)} cells pass; {additivity(result)}; "
         f"{result.computed} of {result.jobs} jobs computed, {result.seconds:.0f} s"
     )
 

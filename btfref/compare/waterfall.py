@@ -1,13 +1,13 @@
 """The error waterfall: which stage between the truth and the screen is to blame, and by how much.
 
 Pictures along the chain differ by one stage each. With e_k the difference that stage k makes, the error of the last
-picture is Σ e_k, and its mean square is Σ ⟨e_k, e_k⟩ + 2 Σ_{j<k} ⟨e_j, e_k⟩: stages *add up* when the second sum is
-nothing, which is so for independent errors, and not where one stage undoes what another did (a compression that
-smooths away the noise of the samples), which the correlation says.
+picture is Σ e_k, and its mean square is Σ ⟨e_k, e_k⟩ + 2 Σ_{j<k} ⟨e_j, e_k⟩: stages *add up* when the second sum, their
+covariances, is nothing, which is so for independent errors, and not where one stage undoes what another did (a
+compression that smooths away the noise of the samples), which the correlation says.
 
 Pictures that carry Monte Carlo noise come as independent batches. A product of differences from two batches that
-share no random number is free of noise on average (see `significance.mse_interval_from_halves`). The stages are
-estimated from one pair of batches and the whole from another pair: their agreement tests the estimates, and is no
+share no random number is free of noise on average (see `significance.mse_interval_from_halves`). Stages and covariances
+are estimated from one pair of batches and the whole from another pair: their agreement tests the estimates, and is no
 identity.
 """
 
@@ -81,6 +81,28 @@ class Stage:
 
 
 @dataclass(frozen=True)
+class Product:
+    """What two stages have in common.
+
+    Parameters
+    ----------
+    stages : (str, str)
+    mse : Interval
+        Twice their mean product: what it adds to the mean square of the whole.
+    correlation : float or None
+        None where a stage has no error to speak of.
+    """
+
+    stages: tuple
+    mse: Interval
+    correlation: float | None
+
+    def to_dict(self):
+        """JSON-able form."""
+        return {"stages": list(self.stages), "mse": self.mse.to_dict(), "correlation": self.correlation}
+
+
+@dataclass(frozen=True)
 class Waterfall:
     """Stages, what they add up to, and whether that is the whole.
 
@@ -90,11 +112,15 @@ class Waterfall:
     total : Interval
         Mean square of the last picture's error, from batches that the stages did not use.
     unexplained : Interval
-        Total − Σ of the stages' mean squares: what products of stages must explain.
+        Total − Σ of the stages' mean squares: what covariances of stages must explain.
+    covariance : Interval
+        Sum of the products of all pairs of stages, from the stages' own batches.
     closure : Interval
-        The same less the products: 0 up to noise.
-    products : tuple of (str, str, float, float)
-        Two stages, twice their mean product as a share of the total, and their correlation; the largest first.
+        Total − stages − covariances: 0 up to noise.
+    products : tuple of Product
+        The largest first.
+    parts : tuple of btfref.compare.parts.Part
+        Shares of stages that are known by themselves.
     mean : float
         Mean of the first picture where it counts.
     pixels : int
@@ -105,8 +131,10 @@ class Waterfall:
     stages: tuple
     total: Interval
     unexplained: Interval
+    covariance: Interval
     closure: Interval
     products: tuple = ()
+    parts: tuple = ()
     mean: float = 0.0
     pixels: int = 0
     gates: tuple = field(default=())
@@ -117,18 +145,34 @@ class Waterfall:
         return self.unexplained.low <= 0 <= self.unexplained.high
 
     @property
+    def explained(self):
+        """Whether stages and covariances explain the total as far as noise lets tell: its gate passed."""
+        return all(gate.passed for gate in self.gates)
+
+    @property
     def explanation(self):
-        """One sentence on how the stages make up the total."""
-        if self.additive:
-            return "The stages' mean squares add up to the total within its interval."
-        share = self.unexplained.estimate / self.total.estimate if self.total.estimate > 0 else np.inf
-        named = [p for p in self.products if abs(p[2]) >= MENTION] or list(self.products[:1])
-        words = "; ".join(
-            f"{a} and {b} {'undo' if r < 0 else 'add to'} each other (correlation {r:.2f}, {100 * s:+.0f} % of the "
-            "total)"
-            for a, b, s, r in named
-        )
-        return f"The stages alone miss {100 * share:+.0f} % of the total: {words}."
+        """How the stages make up the total, in shares of its mean square."""
+        whole = self.total.estimate
+        if not whole > 0:
+            return "No error of the whole is left above the noise."
+        alone = sum(stage.mse.estimate for stage in self.stages) / whole
+        shared = [x / whole for x in (self.covariance.estimate, self.covariance.low, self.covariance.high)]
+        found = alone + shared[0]
+        half = 0.5 * (self.closure.high - self.closure.low) / whole
+        text = f"The stages alone are {_percent(alone)} of the whole's mean square"
+        text += " and add up to it within the interval" if self.additive else ""
+        text += f"; their covariances are {_percent(shared[0], sign=True)}"
+        if shared[2] > shared[1]:
+            text += f" ({_percent(shared[1], sign=True)} to {_percent(shared[2], sign=True)})"
+        named = [
+            p
+            for p in self.products
+            if abs(p.mse.estimate) >= MENTION * whole and (p.mse.low > 0 or p.mse.high < 0)
+        ]
+        if named:
+            text += ": " + "; ".join(_pair(p, whole) for p in named)
+        apart = f" ± {100 * half:.2g}" if half > 0 else ""
+        return f"{text}. Together {_percent(found)}{apart} of the whole, which is measured apart."
 
     def to_dict(self):
         """JSON-able form."""
@@ -137,20 +181,33 @@ class Waterfall:
             "total": rmse_interval(self.total).to_dict(),
             "total_mse": self.total.to_dict(),
             "unexplained": self.unexplained.to_dict(),
+            "covariance": self.covariance.to_dict(),
             "closure": self.closure.to_dict(),
             "additive": self.additive,
+            "explained": self.explained,
             "explanation": self.explanation,
-            "products": [
-                {"stages": [a, b], "share": share, "correlation": correlation}
-                for a, b, share, correlation in self.products
-            ],
+            "products": [product.to_dict() for product in self.products],
+            "parts": [part.to_dict() for part in self.parts],
             "mean": self.mean,
             "pixels": self.pixels,
             "gates": [gate.to_dict() for gate in self.gates],
         }
 
 
-def waterfall(pictures, mask, display):
+def _percent(share, *, sign=False):
+    """A share for a reader: two digits, and whole numbers from ten on."""
+    digits = 0 if abs(share) >= 0.1 else 1
+    return f"{100 * share:{'+' if sign else ''}.{digits}f} %"
+
+
+def _pair(product, whole):
+    a, b = product.stages
+    verb = "undo" if product.mse.estimate < 0 else "add to"
+    known = "" if product.correlation is None else f"correlation {product.correlation:.2f}, "
+    return f"{a} and {b} {verb} each other ({known}{_percent(product.mse.estimate / whole, sign=True)})"
+
+
+def waterfall(pictures, mask, display, *, parts=()):
     """Errors of the stages between pictures.
 
     Parameters
@@ -161,6 +218,8 @@ def waterfall(pictures, mask, display):
         Pixels that count; at least one.
     display : btfref.compare.Display
         For ΔE00.
+    parts : sequence of btfref.compare.parts.Part
+        Shares of stages, to be told beside them.
 
     Returns
     -------
@@ -190,30 +249,32 @@ def waterfall(pictures, mask, display):
     half = np.array([[0.5 * (a + b) for a, b in pair] for pair in pairs])
     spread = np.array([[a - b for a, b in pair] for pair in pairs])
     step, noise = np.diff(half, axis=0), np.diff(spread, axis=0)
+    first, second = ((step[:, pair], noise[:, pair]) for pair in (0, 1))
+    n = len(step)
+    every, own = np.ones((n, n)), np.eye(n)
     stages = []
-    for k in range(1, len(pictures)):
-        mse = _mse(step[k - 1, 0], noise[k - 1, 0])
-        so_far = _mse(half[k, 0] - half[0, 0], spread[k, 0] - spread[0, 0])
-        colours = [_delta_e00(values[k], values[other], display) for other in (k - 1, 0)]
-        stages.append(Stage(pictures[k].name, mse, rmse_interval(mse), rmse_interval(so_far), *colours))
-    total = _mse(half[-1, 1] - half[0, 1], spread[-1, 1] - spread[0, 1])
-    alone = _mse(step[:, 0], noise[:, 0])
-    whole = _mse(half[-1, 0] - half[0, 0], spread[-1, 0] - spread[0, 0])
+    for k in range(n):
+        so_far = np.arange(n) <= k
+        mse = _form(*first, np.diag(own[k]))
+        colours = [_delta_e00(values[k + 1], values[other], display) for other in (k, 0)]
+        found = rmse_interval(_form(*first, np.outer(so_far, so_far)))
+        stages.append(Stage(pictures[k + 1].name, mse, rmse_interval(mse), found, *colours))
+    total, whole = _form(*second, every), _form(*first, every)
     closure = _difference(total, whole)
-    unexplained = _difference(total, alone)
-    error = closure.standard_error
     # Without noise, float64 sums of some thousand products.
-    floor = 1e-12 * max(total.estimate, alone.estimate)
-    gates = judge("waterfall.closure", {"z": Measured(abs(closure.estimate) / max(error, floor, 1e-300))})
+    floor = 1e-12 * max(total.estimate, sum(stage.mse.estimate for stage in stages))
+    z = abs(closure.estimate) / max(closure.standard_error, floor, 1e-300)
     return Waterfall(
         tuple(stages),
         total,
-        unexplained,
+        _difference(total, _form(*first, own)),
+        _form(*first, every - own),
         closure,
-        _products(stages, step[:, 0], noise[:, 0], total.estimate),
+        _products(stages, *first),
+        tuple(parts),
         float(values[0].mean()),
         int(np.count_nonzero(mask)),
-        tuple(gates),
+        tuple(judge("waterfall.closure", {"z": Measured(z)})),
     )
 
 
@@ -225,16 +286,30 @@ def _pairs(batches):
     return [(quarters[0], quarters[1]), (quarters[2], quarters[3])]
 
 
-def _mse(step, noise):
-    """Mean of S² − D²/4 and its interval; leading axes before (pixels, 3) are summed.
+def _form(step, noise, weights):
+    """Mean of a quadratic form Σ w_jk e_j e_k of the stages and its interval.
 
-    S, the half sum, and D, the difference of two batches, are independent for normal noise and D/2 has the noise of S,
-    so that (Σ S D)² estimates the variance of each entry, stages that share a noisy picture included.
+    With S the half sums and D the differences of two batches, S·wS − D·wD / 4 is x·wy of the batches x and y: free of
+    noise on average. (S·wD)² estimates its variance, stages that share a noisy picture included. Channels of a pixel
+    share their paths, so that their products are summed before they are squared.
+
+    Parameters
+    ----------
+    step, noise : array, shape (stages, pixels, 3)
+    weights : array, shape (stages, stages)
+        Symmetric.
+
+    Returns
+    -------
+    Interval
     """
-    size = step.shape[-2] * step.shape[-1]
-    product = (step**2 - noise**2 / 4).reshape(-1, size).sum(0)
-    spread = (step * noise).reshape(-1, size).sum(0)
-    return interval(product.mean(), np.sqrt(np.sum(spread**2)) / size, confidence=CONFIDENCE)
+    weighted = np.tensordot(weights, noise, 1)
+    product = np.sum(step * np.tensordot(weights, step, 1) - noise * weighted / 4, (0, 2))
+    spread = np.sum(step * weighted, (0, 2))
+    channels = step.shape[-1]
+    return interval(
+        product.mean() / channels, np.linalg.norm(spread) / spread.size / channels, confidence=CONFIDENCE
+    )
 
 
 def _difference(a, b):
@@ -243,18 +318,22 @@ def _difference(a, b):
     return interval(a.estimate - b.estimate, error, confidence=CONFIDENCE)
 
 
-def _products(stages, step, noise, total):
+def _products(stages, step, noise):
     """Pairs of stages by the size of their mean product."""
-    found = []
-    for j in range(len(stages)):
-        for k in range(j + 1, len(stages)):
-            mean = float(np.mean(step[j] * step[k] - noise[j] * noise[k] / 4))
-            scale = np.sqrt(max(stages[j].mse.estimate, 0) * max(stages[k].mse.estimate, 0))
-            correlation = float(np.clip(mean / scale, -1, 1)) if scale > 0 else 0.0
-            found.append(
-                (stages[j].name, stages[k].name, 2 * mean / total if total > 0 else 0.0, correlation)
+    found, n = [], len(stages)
+    for j in range(n):
+        for k in range(j + 1, n):
+            weights = np.zeros((n, n))
+            weights[[j, k], [k, j]] = 1
+            mse = _form(step, noise, weights)
+            a, b = (stages[i].mse for i in (j, k))
+            # A stage that may be nothing but noise has no direction.
+            known = a.low > 0 and b.low > 0
+            correlation = (
+                float(np.clip(mse.estimate / 2 / np.sqrt(a.estimate * b.estimate), -1, 1)) if known else None
             )
-    return tuple(sorted(found, key=lambda p: -abs(p[2])))
+            found.append(Product((stages[j].name, stages[k].name), mse, correlation))
+    return tuple(sorted(found, key=lambda p: -abs(p.mse.estimate)))
 
 
 def _delta_e00(test, reference, display):

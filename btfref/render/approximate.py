@@ -19,7 +19,9 @@ from btfref.render.scene import read_scene
 from btfref.render.visible import visible_points
 
 
-def approximate(scene, *, parameters=None, path="auto", grid=4, size=None, load_file=None, **options):
+def approximate(
+    scene, *, parameters=None, path="auto", grid=4, size=None, load_file=None, pixels=None, **options
+):
     """What :func:`btfref.render.realtime.realtime` approximates, evaluated in float64.
 
     Parameters
@@ -35,6 +37,8 @@ def approximate(scene, *, parameters=None, path="auto", grid=4, size=None, load_
         Width and height in place of the scene's.
     load_file : callable, optional
         ``path -> Representation``; the default reads the files.
+    pixels : ndarray of bool, shape (H, W), optional
+        Those that are evaluated; the others stay black.
     **options
         ``lights``, ``order``, ``window`` and ``transfer`` as for ``realtime``.
 
@@ -58,7 +62,9 @@ def approximate(scene, *, parameters=None, path="auto", grid=4, size=None, load_
     lighting = lighting_of(description, path, **options)
     start = time.perf_counter()
     reps, prepared, total = {}, {}, None
-    for points in visible_points(scene, description, parameters=parameters, size=size, grid=grid):
+    for points in visible_points(
+        scene, description, parameters=parameters, size=size, grid=grid, pixels=pixels
+    ):
         if total is None:
             total = np.zeros((points.shape[0] * points.shape[1], 3))
         name = points.material.filename

@@ -185,7 +185,7 @@ class Renderer:
         self._n_lights, self._lighting = len(scene.lights), lighting
         if lighting is None:
             self._lighting = lighting_of(scene)
-        self._light_facts, self._depth = {}, None
+        self._light_facts, self._depth, self._seen = {}, None, None
         self._counting = {"COUNT_FETCHES": 1} if count_fetches else {}
         try:
             for number, mesh in enumerate(scene.meshes):
@@ -218,11 +218,36 @@ class Renderer:
                 self.ctx, rep, filter_type=material.filter_type, light=light
             )
             defines = {"N_LIGHTS": self._n_lights, **self._counting}
-            program = shown.program(self.ctx, "hosts/mesh.vert", "hosts/mesh.frag", defines=defines)
+            by_pixel = light is not None and len(light.passes) > 1 and light.bins is None
+            if by_pixel:
+                defines["SEEN"] = 1
+                self._make_seen()
+            vertex = "hosts/screen.vert" if by_pixel else "hosts/mesh.vert"
+            program = shown.program(self.ctx, vertex, "hosts/mesh.frag", defines=defines)
             self._own(program), self._own(shown)
             self._shown[key] = shown, program, self._own(self.ctx.vertex_array(program, [])), light
         table = self._own(gl.upload(self.ctx, triangle_table(mesh), "triangles"))
         self._meshes.append((mesh, key, table))
+
+    def _make_seen(self):
+        """What each pixel sees: passes that add up shade pixels, not triangles of less than a pixel anew each time."""
+        if self._seen is None:
+            size = (self.camera.width, self.camera.height)
+            texture = self._own(self.ctx.texture(size, 2, dtype="f4"))
+            target = self._own(self.ctx.framebuffer([texture], self._own(self.ctx.depth_renderbuffer(size))))
+            program = self._own(gl.compile_program(self.ctx, "hosts/mesh.vert", "hosts/seen.frag"))
+            self._seen = texture, target, program, self._own(self.ctx.vertex_array(program, []))
+
+    def _fill_seen(self, common):
+        """Find what each pixel sees, in all meshes."""
+        _, target, program, vertices = self._seen
+        target.use()
+        target.clear(0.0, 0.0, 0.0, 0.0)
+        for number, (mesh, _, table) in enumerate(self._meshes):
+            gl.bind(program, {"triangles": table})
+            gl.set_uniforms(program, {**common, "mesh": number})
+            vertices.render(self.ctx.TRIANGLES, vertices=3 * len(mesh.faces))
+        self._target.use()
 
     def _depth_program(self):
         """Black surfaces: what fills the depth buffer before pictures are added up."""
@@ -268,13 +293,20 @@ class Renderer:
         query = ctx.query(time=True)
         with query:
             if any(light is not None and len(light.passes) > 1 for *_, light in self._shown.values()):
+                if self._seen is not None:
+                    self._fill_seen(common)
                 self._fill_depth(common)
-            for mesh, key, table in self._meshes:
+            for index, (mesh, key, table) in enumerate(self._meshes):
                 shown, program, vertices, light = self._shown[key]
-                gl.bind(program, {**shown.textures, "triangles": table})
+                tables, by_pixel = {**shown.textures, "triangles": table}, "seen" in program
+                if by_pixel:
+                    tables["seen"] = self._seen[0]
+                    ctx.depth_func, self._target.depth_mask = ">", False
+                gl.bind(program, tables)
                 row0, row1 = mesh.material.to_uv
                 own = {"uv_row0": row0, "uv_row1": row1, "scale": mesh.material.scale}
                 own["uv_rotation"] = mesh.material.rotation
+                own["mesh"] = index
                 own |= lod_uniforms(mesh.material, shown.texels, share * camera.pixel_angle)
                 gl.set_uniforms(program, {**common, **own, "two_sided": mesh.material.twosided})
                 passes, counts = ({},), [len(mesh.faces)]
@@ -285,7 +317,9 @@ class Renderer:
                         gl.set_uniforms(program, {"transfer_components": light.transfer.table.shape[3]})
                 for number, (values, count) in enumerate(zip(passes, counts, strict=True)):
                     gl.set_uniforms(program, {**values, "pass": number})
-                    vertices.render(ctx.TRIANGLES, vertices=3 * count)
+                    vertices.render(ctx.TRIANGLES, vertices=3 if by_pixel else 3 * count)
+                if by_pixel:
+                    ctx.depth_func, self._target.depth_mask = "<=", True
         ctx.depth_func = "<"
         ctx.disable(ctx.BLEND)
         ctx.finish()

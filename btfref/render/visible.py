@@ -93,7 +93,7 @@ class Points:
         return triangle, _barycentric(corners[triangle], self.position)
 
 
-def visible_points(scene, description, *, parameters=None, size=None, grid=4):
+def visible_points(scene, description, *, parameters=None, size=None, grid=4, pixels=None):
     """Primary hits of a regular sub-pixel grid, sample by sample and shape by shape.
 
     Parameters
@@ -101,8 +101,8 @@ def visible_points(scene, description, *, parameters=None, size=None, grid=4):
     scene : path-like or dict
     description : SceneDescription
         Of the same scene.
-    parameters, size, grid
-        As of :func:`approximate`.
+    parameters, size, grid, pixels
+        As of :func:`btfref.render.approximate.approximate`.
 
     Yields
     ------
@@ -133,8 +133,11 @@ def visible_points(scene, description, *, parameters=None, size=None, grid=4):
             surface = [np.array(v, float).T for v in (si.p, si.n, si.dp_du, si.dp_dv)]
             uv, wi = np.array(si.uv, float).T, np.array(si.wi, float).T
             frame, triangle = np.stack(frame, 1), np.array(si.prim_index)
+            seen = np.array(si.is_valid())
+            if pixels is not None:
+                seen &= np.ravel(pixels)
             for number, (mesh, shape) in enumerate(zip(description.meshes, made.shapes(), strict=True)):
-                at = np.flatnonzero(np.array(si.is_valid() & (si.shape == mi.ShapePtr(shape))))
+                at = np.flatnonzero(seen & np.array(si.shape == mi.ShapePtr(shape)))
                 if not len(at):
                     continue
                 material = mesh.material
@@ -149,18 +152,18 @@ def visible_points(scene, description, *, parameters=None, size=None, grid=4):
                 name = material.filename
                 if name not in texels:
                     texels[name] = read_info(name)["shape"][2:4]
-                seen = [a[at] for a in surface]
+                place = [a[at] for a in surface]
                 yield Points(
                     (camera.height, camera.width),
                     at,
                     material,
                     number,
-                    seen[0],
+                    place[0],
                     uv[at] @ material.to_uv[:, :2].T + material.to_uv[:, 2],
                     w_view,
                     to_local.transpose(0, 2, 1),
                     triangle[at],
-                    _footprint(material, texels[name], camera, grid, *seen),
+                    _footprint(material, texels[name], camera, grid, *place),
                 )
 
 

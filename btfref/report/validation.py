@@ -16,7 +16,7 @@ from btfref.report.text import badge, facts_list, gate_list, number
 from btfref.report.waterfall_figure import waterfall_section
 from btfref.validate.cell import gate_from
 from btfref.validate.run import method_name
-from btfref.validate.summary import HEADER, rows
+from btfref.validate.summary import HEADER, additivity, rows
 
 #: Mantissa bits of pictures and of error maps on the pages: enough for eyes, and little to store.
 PICTURE_BITS, MAP_BITS = 6, 4
@@ -144,8 +144,7 @@ def _index(folder, result, self_test, thumbnails):
     outcomes = [cell.outcome for cell in result.cells]
     failed = result.failed_gates
     kind, word = ("pass", "All gates pass") if result.passed else ("fail", "Gates fail")
-    additive = sum(bool((c.facts["waterfall"] or {}).get("additive")) for c in result.cells)
-    counts = f"{outcomes.count('pass')} of {len(outcomes)} cells pass; stages add up in {additive}, the others say why"
+    counts = f"{outcomes.count('pass')} of {len(outcomes)} cells pass; {additivity(result)}"
     sections = [
         ("matrix", "Matrix", _matrix(result, thumbnails)),
         ("failures", "What failed", _failures(failed) if failed else '<p class="muted">Nothing.</p>'),

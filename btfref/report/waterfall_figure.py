@@ -28,48 +28,73 @@ def waterfall_figure(fall):
         An ``<svg>`` element whose colours come from the page's style.
     """
     stages = fall["stages"]
-    values = [s["rmse"]["high"] for s in stages] + [s["rmse_so_far"]["high"] for s in stages]
-    largest = max([v for v in values if v > 0], default=1.0)
+    rows = [(stage["name"], stage) for stage in stages]
+    for share in fall["parts"]:
+        at = 1 + [name for name, _ in rows].index(share["of"])
+        rows.insert(at, (f"of it {share['name']}", share))
+    both = [stage[key] for stage in stages for key in ("rmse", "rmse_so_far")]
+    largest = max([v["high"] for v in both if v["high"] > 0], default=1.0)
     top = float(np.ceil(np.log10(largest) + 1e-9))
-    there = [v for s in stages for v in (s["rmse"]["estimate"],) if v > 0]
+    there = [v for _, row in rows for v in (row["rmse"]["estimate"],) if v > 0]
     low = max(top - DECADES, float(np.floor(np.log10(min(there, default=largest)))))
     low = min(low, top - 1)
-    height = _TOP + _ROW * (len(stages) + 1) + 30
+    base = _TOP + _ROW * (len(rows) + 2)
+    height = base + 30
 
     def x(value):
         log = np.log10(value) if value > 0 else low
         return _LEFT + (np.clip(log, low, top) - low) / (top - low) * (_WIDTH - _LEFT - _RIGHT)
 
-    base = _TOP + _ROW * (len(stages) + 1)
     parts = []
     for decade in range(int(low), int(top) + 1):
         at = x(10.0**decade)
         parts.append(f'<line class="grid" x1="{at:.1f}" y1="{_TOP}" x2="{at:.1f}" y2="{base}"/>')
         parts.append(_text(at, base + 15, f"1e{decade}".replace("-", "−"), "middle"))
-    for row, stage in enumerate(stages):
+    for row, (name, stage) in enumerate(rows):
         y = _TOP + _ROW * row
-        parts.append(_text(_LEFT - 8, y + 17, stage["name"], "end", "axis"))
+        parts.append(_text(_LEFT - 8, y + 17, name, "end", "axis"))
         parts.append(_bar(x, stage["rmse"], y + 4, 12, "series interior", low))
-        parts.append(_bar(x, stage["rmse_so_far"], y + 18, 8, "series silhouette", low))
+        if "rmse_so_far" in stage:
+            parts.append(_bar(x, stage["rmse_so_far"], y + 18, 8, "series silhouette", low))
         text = f"{number(stage['rmse']['estimate'])}, ΔE00 {number(stage['delta_e00']['estimate'], 2)}"
         parts.append(_text(_WIDTH - _RIGHT + 8, y + 17, text, "start"))
-    y = _TOP + _ROW * len(stages)
+    y = _TOP + _ROW * len(rows)
+    parts.append(_text(_LEFT - 8, y + 17, "covariances", "end", "axis"))
+    parts.append(_bar(x, _magnitude(fall["covariance"]), y + 4, 12, "series mesostructure", low))
+    parts.append(_text(_WIDTH - _RIGHT + 8, y + 17, _signed_root(fall["covariance"]["estimate"]), "start"))
+    y += _ROW
     parts.append(_text(_LEFT - 8, y + 17, "whole", "end", "axis"))
     parts.append(_bar(x, fall["total"], y + 6, 14, "series silhouette", low))
     colour = stages[-1]["delta_e00_so_far"]["estimate"]
     text = f"{number(fall['total']['estimate'])}, ΔE00 {number(colour, 2)}"
     parts.append(_text(_WIDTH - _RIGHT + 8, y + 17, text, "start"))
-    for at, kind, text in (
-        (_LEFT, "interior", "alone"),
-        (_LEFT + 70, "silhouette", "so far, against the truth"),
-    ):
-        parts.append(f'<rect class="key {kind}" x="{at}" y="8" width="10" height="10"/>')
-        parts.append(_text(at + 15, 17, text, "start"))
+    keys = (
+        ("interior", "alone"),
+        ("silhouette", "so far, against the truth"),
+        ("mesostructure", "covariances"),
+    )
+    for at, (kind, text) in zip((0, 70, 235), keys, strict=True):
+        parts.append(f'<rect class="key {kind}" x="{_LEFT + at}" y="8" width="10" height="10"/>')
+        parts.append(_text(_LEFT + at + 15, 17, text, "start"))
     parts.append(_text((_LEFT + _WIDTH - _RIGHT) / 2, height - 2, "RMSE of radiance", "middle", "axis"))
     return (
         f'<svg class="chart waterfall" viewBox="0 0 {_WIDTH} {height}" role="img" '
         f'aria-label="Errors of the stages">{"".join(parts)}</svg>'
     )
+
+
+def _magnitude(mse):
+    """Interval of the root of a mean square's size, whatever its sign."""
+    low, high = sorted(abs(mse[name]) for name in ("low", "high"))
+    if mse["low"] < 0 < mse["high"]:
+        low = 0.0
+    ends = {"low": low, "high": high, "estimate": abs(mse["estimate"])}
+    return {name: float(np.sqrt(value)) for name, value in ends.items()}
+
+
+def _signed_root(mse):
+    """√ of a mean square with its sign, as text: what it adds to the whole, or takes from it."""
+    return f"{'−' if mse < 0 else '+'}{number(float(np.sqrt(abs(mse))))} (root)"
 
 
 def _bar(x, interval, y, height, kind, low):
@@ -102,12 +127,22 @@ def waterfall_table(fall):
     head = "".join(
         f'<th scope="col">{name}</th>' for name in ("RMSE alone", "RMSE so far", "ΔE00 alone", "ΔE00 so far")
     )
-    rows = "".join(
-        f'<tr><th scope="row">{escape(stage["name"])}</th>'
-        + "".join(_cell(stage[key]) for key in keys)
-        + "</tr>"
-        for stage in fall["stages"]
+    shares = {share["of"]: share for share in fall["parts"]}
+    rows = ""
+    for stage in fall["stages"]:
+        rows += f'<tr><th scope="row">{escape(stage["name"])}</th>' + "".join(
+            _cell(stage[key]) for key in keys
+        )
+        if share := shares.get(stage["name"]):
+            name = f"{share['name']}, a part of it, at {share['pixels']} pixels"
+            rows += f'</tr><tr><th scope="row">{escape(name)}</th>{_cell(share["rmse"])}<td></td>'
+            rows += f"{_cell(share['delta_e00'])}<td></td>"
+        rows += "</tr>"
+    shared = fall["covariance"]
+    rows += (
+        f'<tr><th scope="row">covariances, with their sign</th><td>{_signed_root(shared["estimate"])}</td>'
     )
+    rows += "<td></td><td></td><td></td></tr>"
     whole = f'<tr><th scope="row">whole, measured apart</th><td></td>{_cell(fall["total"])}<td></td><td></td></tr>'
     return (
         f'<div class="scroll"><table class="metrics"><thead><tr><th scope="col">stage</th>{head}</tr></thead>'

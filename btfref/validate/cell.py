@@ -11,13 +11,14 @@ import numpy as np
 from btfref.compare import compare, json_safe
 from btfref.compare.colour import Display, decode_srgb, fit_display
 from btfref.compare.gates import GateResult, missing_reference
+from btfref.compare.parts import part
 from btfref.compare.waterfall import Picture, waterfall
 from btfref.errors import BtfrefError
 from btfref.scenes import scene_file
 from btfref.validate.cache import code_of, key_of
 from btfref.validate.material import fit_key
-from btfref.validate.matrix import LIGHTS
-from btfref.validate.pictures import fitted, make_views, noisy_pictures, views_key
+from btfref.validate.matrix import ENVIRONMENTS
+from btfref.validate.pictures import fitted, make_views, shared_settings, views_key
 
 #: Gates of a picture in real time against the reference under delta lights.
 GATES = (
@@ -33,6 +34,9 @@ ENVIRONMENT_GATES = {
     "lights": ("image.environment_lights", "image.background"),
     "prefiltered": ("image.environment", "image.environment_tiles", "image.background"),
 }
+
+#: Pixel classes that the waterfall counts: interior, and where the mesostructure's own silhouettes fall.
+COUNTED = (1, 3)
 
 #: Samples per pixel of a reference under an environment at most.
 MOST = 1 << 13
@@ -125,7 +129,7 @@ def make_cell(cache, spec, settings):
 
 def failed_cell(spec, why):
     """A cell whose reference, or whose picture, could not be made: a failure of every gate."""
-    keys = GATES if "environment" not in LIGHTS.get(spec.lights, {}) else ENVIRONMENT_GATES["lights"]
+    keys = GATES if spec.lights not in ENVIRONMENTS else ENVIRONMENT_GATES["lights"]
     gates = [g.to_dict() for key in keys for g in missing_reference(key, why)]
     facts = {"name": spec.name, **vars(spec), "gates": gates, "notes": why, "waterfall": None}
     return CellResult(json_safe(facts), {})
@@ -152,21 +156,19 @@ def _cell(cache, spec, settings):
     start = time.perf_counter()
     file, path = fitted(cache, spec, settings), scene_file(spec.scene)
     views = make_views(cache, spec.mesostructure, spec.scene, spec.lights, settings)
-    shared = {
-        "parameters": {"btf": str(file), **LIGHTS[spec.lights]},
-        "size": (settings.size, settings.size),
-    }
-    under = _under_environment if "environment" in LIGHTS[spec.lights] else _under_deltas
-    chain, reference, image, gates, facts = under(path, file, spec, views, settings, shared)
+    shared = shared_settings(file, spec.lights, settings)
+    under = _under_environment if spec.lights in ENVIRONMENTS else _under_deltas
+    chain, reference, image, gates, facts, parts = under(path, spec, views, settings, shared)
     display = fit_display(views.truth.mean(0), views.classes > 0)
-    counts = np.isin(views.classes, (1, 3))
+    counts = np.isin(views.classes, COUNTED)
     chain = [
         Picture("geometry", views.truth),
         Picture("sampled BTF", views.sampled),
         *chain,
         Picture("8 bits", eight_bits(image.image, display)[None]),
     ]
-    found = waterfall(chain, counts, display)
+    parts = [part(*each, display) for each in parts]
+    found = waterfall(chain, counts, display, parts=parts)
     comparison = compare(
         image.image, reference.image, classes=views.classes, gate=gates, variance=reference.variance
     )
@@ -193,46 +195,47 @@ def _cell(cache, spec, settings):
     return CellResult(json_safe(facts), images, views.classes, reference.variance)
 
 
-def _under_deltas(path, file, spec, views, settings, shared):
-    """Chain, reference, picture in real time, gates and facts where nothing is random."""
+def _under_deltas(path, spec, views, settings, shared):
+    """Chain, reference, picture in real time, gates, facts and parts of stages where nothing is random."""
     from btfref.render.approximate import approximate
     from btfref.render.realtime import realtime
     from btfref.render.reference import render
 
-    definition = approximate(path, grid=settings.grid, **shared)
-    reference = render(path, noise_free=settings.grid, shadows=False, **shared)
-    image = realtime(path, grid=settings.grid, **shared)
+    scene = {name: shared[name] for name in ("parameters", "size")}
+    definition = approximate(path, **shared)
+    reference = render(path, noise_free=shared["grid"], shadows=False, **scene)
+    image = realtime(path, **shared)
     chain = [("fit", definition.image), ("port", reference.image), ("real time", image.image)]
-    return [Picture(name, picture[None]) for name, picture in chain], reference, image, GATES, {}
+    return [Picture(name, picture[None]) for name, picture in chain], reference, image, GATES, {}, ()
 
 
-def _under_environment(path, file, spec, views, settings, shared):
+def _under_environment(path, spec, views, settings, shared):
     """The same under an environment: the reference is traced until its noise decides nothing.
 
-    Real time approximates here, so that the stage in float64 comes before its port.
+    Its four batches are the stage of the fit as well. Real time approximates here, and its port is a part of that
+    stage: GLSL against the same approximation in float64, at pixels drawn at random.
     """
     from btfref.render.approximate import approximate
     from btfref.render.converged import converged
     from btfref.render.realtime import realtime
 
-    image = realtime(path, grid=settings.grid, **shared)
-    definition = approximate(path, grid=settings.grid, **shared)
+    image = realtime(path, **shared)
     way = image.meta["environment_path"]
     gates = ENVIRONMENT_GATES[way]
-    mask = views.classes == 1
-    reference = converged(path, mask, gate=gates[0], shadows=False, grid=settings.grid, most=MOST, **shared)
-    pictures = noisy_pictures(path, file, spec.lights, settings, seed=settings.seed + 5)
-    chain = [
-        Picture("fit", pictures),
-        Picture("real time", definition.image[None]),
-        Picture("port", image.image[None]),
-    ]
+    reference = converged(path, views.classes == 1, gate=gates[0], shadows=False, most=MOST, **shared)
+    some = np.zeros(views.classes.shape, bool)
+    there = np.flatnonzero(np.isin(views.classes, COUNTED))
+    rng = np.random.default_rng(settings.seed)
+    some.flat[rng.choice(there, min(settings.port_pixels, len(there)), replace=False)] = True
+    definition = approximate(path, pixels=some, **shared)
+    chain = [Picture("fit", reference.meta["batches"]), Picture("real time", image.image[None])]
     facts = {
         "environment_path": way,
         "reference_spp": reference.meta["spp"],
         "reference_noise": reference.meta["noise"],
     }
-    return chain, reference, image, gates, facts
+    parts = [("port", "real time", image.image[some], definition.image[some])]
+    return chain, reference, image, gates, facts, parts
 
 
 def eight_bits(image, display):

@@ -11,12 +11,15 @@ from btfref.scenes import scene_file
 #: Scenes that show a BTF on a shape of their own: flat, curved, folded and seen from both sides.
 SCENES = ("plane", "sphere", "cloth")
 
+#: From all sides alike, a sun and sky, four soft boxes, a small light on black.
+ENVIRONMENTS = ("constant", "sky", "studio", "bright-texel")
+
 #: Lights → parameters of the shipped scenes. Under an environment (those with that parameter) nothing is free of noise.
 LIGHTS = {
     "directional1": {"lights": "directional1"},
     "directional3": {"lights": "directional3"},
     "points2": {"lights": "points2"},
-    "sky": {"lights": "envmap", "environment": "sky"},
+    **{name: {"lights": "envmap", "environment": name} for name in ENVIRONMENTS},
 }
 
 MESOSTRUCTURES = ("checker", "rings", "tissue")
@@ -64,13 +67,18 @@ class Settings:
     spp : int
         Of the synthesis.
     size : int
-        Edge of the pictures in pixels.
-    grid : int
-        Sub-pixels per axis, the same in all renderers.
+        Edge of the pictures in pixels under delta lights.
+    environment_size : int
+        The same under environments, where hundreds of lights stand for the thousands of samples of a reference.
+    grid, environment_grid : int
+        Sub-pixels per axis under delta lights and under environments, the same in all renderers. The limits of
+        silhouettes are those of 4.
     truth_spp : int
         Paths per pixel and batch of the truth; there are four batches.
     environment_spp : int
-        The same of the path-traced reference under an environment.
+        Samples per pixel of the path-traced sampled BTF under an environment, in four batches.
+    port_pixels : int
+        Pixels at which the approximation under an environment is evaluated in float64.
     held_out_texels : int
         Texels along each side for the fits that leave directions out.
     chi2_samples : int
@@ -82,13 +90,24 @@ class Settings:
     directions: str = "ubo81"
     estimator: str = "surface"
     spp: int = 16
-    size: int = 112
-    grid: int = 2
-    truth_spp: int = 64
-    environment_spp: int = 64
+    size: int = 80
+    environment_size: int = 56
+    grid: int = 4
+    environment_grid: int = 2
+    truth_spp: int = 128
+    environment_spp: int = 1024
+    port_pixels: int = 100
     held_out_texels: int = 32
     chi2_samples: int = 1_000_000
     seed: int = 0
+
+    def edge(self, lights):
+        """Edge of the pictures under some lights, in pixels."""
+        return self.environment_size if lights in ENVIRONMENTS else self.size
+
+    def cells(self, lights):
+        """Sub-pixels per axis under some lights."""
+        return self.environment_grid if lights in ENVIRONMENTS else self.grid
 
     def to_dict(self):
         """JSON-able form."""
@@ -97,7 +116,13 @@ class Settings:
 
 FULL = Settings()
 QUICK = replace(
-    FULL, texels=32, size=72, truth_spp=96, environment_spp=32, held_out_texels=16, chi2_samples=200_000
+    FULL,
+    texels=32,
+    size=48,
+    environment_size=40,
+    truth_spp=192,
+    held_out_texels=16,
+    chi2_samples=200_000,
 )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from btfref.scenes import scene_file
 from btfref.validate.cache import code_of, key_of
 from btfref.validate.material import fit_key, load_material, make_fit, make_material, material_key
-from btfref.validate.matrix import LIGHTS
+from btfref.validate.matrix import ENVIRONMENTS, LIGHTS
 
 #: Fit whose file stands for the material where only its origin counts: the smallest one.
 CARRIER = {"method": "svd", "parameters": {"components": 1}}
@@ -41,12 +41,13 @@ class Views:
 
 def views_key(mesostructure, scene, lights, settings):
     """Key of a `Views`."""
-    named = ("size", "grid", "truth_spp", "environment_spp")
+    named = ("truth_spp", "environment_spp")
     return key_of(
         {
             "views": material_key(mesostructure, settings),
             "scene": scene_file(scene).read_text("utf-8"),
             "lights": LIGHTS[lights],
+            "size": [settings.edge(lights), settings.cells(lights)],
             **{name: getattr(settings, name) for name in named},
             "carrier": CARRIER,
             "code": code_of("picture", CARRIER["method"]),
@@ -74,18 +75,24 @@ def _views(cache, mesostructure, scene, lights, settings):
     from btfref.render.approximate import approximate
     from btfref.render.classes import pixel_classes
     from btfref.render.exact import render_exact
+    from btfref.render.reference import render
 
     stores = make_material(cache, mesostructure, settings)
     carrier = make_carrier(cache, mesostructure, settings)
-    path, size = scene_file(scene), (settings.size, settings.size)
-    parameters = {"btf": str(carrier), **LIGHTS[lights]}
-    shared = {"parameters": parameters, "grid": settings.grid, "size": size}
+    path = scene_file(scene)
+    shared = shared_settings(carrier, lights, settings)
     truth = render_exact(path, spp=settings.truth_spp, seed=TRUTH_SEED, **shared)
     classes = pixel_classes(path, **shared)
-    if "environment" in LIGHTS[lights]:
+    if lights in ENVIRONMENTS:
         table = make_fit(cache, mesostructure, "raw", settings)
-        pictures = noisy_pictures(path, table, lights, settings, seed=TRUTH_SEED + 1)
-        return Views(truth.meta["batches"], pictures, np.zeros(0, np.float32), classes)
+        pictures = render(
+            path,
+            spp=settings.environment_spp,
+            seed=TRUTH_SEED + 1,
+            shadows=False,
+            **shared_settings(table, lights, settings),
+        )
+        return Views(truth.meta["batches"], pictures.meta["batches"], np.zeros(0, np.float32), classes)
     seen = []
     for store in stores:
         table = method("raw").fit(load_material(store))
@@ -93,14 +100,14 @@ def _views(cache, mesostructure, scene, lights, settings):
     return Views(truth.meta["batches"], seen[0][None], seen[1], classes)
 
 
-def noisy_pictures(path, file, lights, settings, *, seed):
-    """Independent pictures of a representation under an environment by paths, float32 (4, H, W, 3)."""
-    from btfref.render.reference import render
-
-    parameters, size = {"btf": str(file), **LIGHTS[lights]}, (settings.size, settings.size)
-    seeds = np.random.SeedSequence(seed).generate_state(4)
-    shared = {"spp": settings.environment_spp, "grid": settings.grid, "shadows": False, "size": size}
-    return np.stack([render(path, parameters=parameters, seed=int(s), **shared).image for s in seeds])
+def shared_settings(file, lights, settings):
+    """What all renderers of a cell are told alike."""
+    edge = settings.edge(lights)
+    return {
+        "parameters": {"btf": str(file), **LIGHTS[lights]},
+        "grid": settings.cells(lights),
+        "size": (edge, edge),
+    }
 
 
 def make_carrier(cache, mesostructure, settings):

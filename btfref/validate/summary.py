@@ -56,8 +56,17 @@ def rows(result):
     return table
 
 
+def additivity(result):
+    """How many waterfalls add up, in words: by their stages alone, and together with their covariances."""
+    falls = [cell.facts["waterfall"] for cell in result.cells if cell.facts["waterfall"]]
+    alone = sum(fall["additive"] for fall in falls)
+    explained = sum(fall["explained"] for fall in falls)
+    return f"stages alone add up in {alone} cells, stages and covariances in {explained} of {len(falls)} waterfalls"
+
+
 def _stage(fall, name):
-    found = [s["rmse"]["estimate"] for s in fall["stages"] if s["name"] == name]
+    stages = [*fall["stages"], *fall["parts"]]
+    found = [s["rmse"]["estimate"] for s in stages if s["name"] == name]
     return _relative(found[0], fall) if found else None
 
 

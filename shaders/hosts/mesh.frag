@@ -22,11 +22,25 @@ uniform float scale;
 uniform bool two_sided;
 uniform int pass;           // number of this picture among those that add up
 
+#ifdef SEEN
+uniform highp sampler2D seen;  // what each pixel sees, from hosts/seen.frag
+uniform int mesh;              // that is drawn
+#else
 flat in int triangle;
+#endif
 
 out vec4 radiance;
 
 void main() {
+#ifdef SEEN
+    vec2 identity = texelFetch(seen, ivec2(gl_FragCoord.xy), 0).rg;
+    int triangle = int(identity.r) - 1;
+    // No discard: it would put the depth test, which leaves the background out, behind the shading.
+    if (triangle < 0 || int(identity.g) != mesh) {
+        radiance = vec4(0.0);
+        return;
+    }
+#endif
     vec2 film = vec2(gl_FragCoord.x, film_height - gl_FragCoord.y) + film_offset;
     vec3 direction = normalize(ray_corner + film.x * ray_right + film.y * ray_down);
     SurfacePoint point = scene_intersect(triangles, triangle, camera_origin, direction);

@@ -106,7 +106,12 @@ def test_a_lost_piece_fails_the_probe(need, rng, fits, tmp_path, monkeypatch):
     assert not found.passed
 
 
-STAGES = [("hosts/probe.vert", "hosts/probe.frag"), ("hosts/mesh.vert", "hosts/mesh.frag")]
+STAGES = [
+    ("hosts/probe.vert", "hosts/probe.frag"),
+    ("hosts/mesh.vert", "hosts/mesh.frag"),
+    ("hosts/mesh.vert", "hosts/seen.frag"),
+    ("hosts/screen.vert", "hosts/depth.frag"),
+]
 
 
 @pytest.mark.parametrize("target", composer.TARGETS)

@@ -1,0 +1,57 @@
+"""Shares of stages of the error waterfall that are measured on their own, at a few pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from btfref.compare.colour import delta_e00
+from btfref.compare.significance import Interval, interval, rmse_interval
+from btfref.compare.waterfall import CONFIDENCE
+
+
+@dataclass(frozen=True)
+class Part:
+    """A share of a stage that is measured on its own, at some of the pixels; see :func:`part`.
+
+    Parameters
+    ----------
+    name, of : str
+        The part and its stage.
+    rmse, delta_e00 : Interval
+        They hold the choice of pixels.
+    pixels : int
+    """
+
+    name: str
+    of: str
+    rmse: Interval
+    delta_e00: Interval
+    pixels: int
+
+    def to_dict(self):
+        """JSON-able form."""
+        return {**vars(self), "rmse": self.rmse.to_dict(), "delta_e00": self.delta_e00.to_dict()}
+
+
+def part(name, of, test, reference, display):
+    """A part of a stage from pictures without noise at pixels that were drawn at random.
+
+    Parameters
+    ----------
+    name, of : str
+    test, reference : array, shape (pixels, 3)
+    display : btfref.compare.Display
+
+    Returns
+    -------
+    Part
+    """
+    square = np.mean((np.asarray(test, float) - reference) ** 2, 1)
+    colour, n = delta_e00(test, reference, display), max(len(square), 2)
+    mse, colour = (
+        interval(x.mean(), x.std() / np.sqrt(n - 1), confidence=CONFIDENCE, freedom=n - 1)
+        for x in (square, colour)
+    )
+    return Part(name, of, rmse_interval(mse), colour, len(square))
