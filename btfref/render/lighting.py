@@ -7,6 +7,7 @@ where texels share tables over lights. A way that is made ready for a representa
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -29,6 +30,10 @@ ALBEDO_SAMPLES = 512
 #: Lights of a picture that is drawn at once: Mesa's llvmpipe ends a shader's loops, all together, after 65 535 steps
 #: (LP_MAX_TGSI_LOOP_ITERATIONS) without a word, and drivers of GPUs end draws that take seconds.
 PASS = 32
+
+#: Environments whose lights are kept for the next picture: two renderers ask for the same ones.
+KEPT = 4
+_LIGHTINGS = {}
 
 #: Values of B evaluated at a time in float64.
 BLOCK = 1 << 18
@@ -118,6 +123,7 @@ class Lighting:
         self._order, self._window = harmonics.checked_order(order), window
         harmonics.window(window, order)
         self._meshes, self._transfer = tuple(meshes), transfer or TransferSettings()
+        self._made = {}
 
     @cached_property
     def light_set(self):
@@ -187,7 +193,8 @@ class Lighting:
             path = "prefiltered" if prefiltered and self._count is None else "lights"
         if path == "transfer":
             return self._by_transfer(representation, file, mesh)
-        return getattr(self, f"_by_{path}")(representation, file)
+        content = (path, *_content(representation.arrays(), representation.meta))
+        return _remembered(self._made, content, lambda: getattr(self, f"_by_{path}")(representation, file), 1)
 
     def _by_prefiltered(self, representation, file):
         light = image_light(representation.meta["method"], file=file)
@@ -345,4 +352,37 @@ def lighting_of(scene, path="auto", **options):
             got=len(scene.lights),
         )
     given = {k: v for k, v in options.items() if v is not None}
-    return Lighting(scene.environment, path, meshes=scene.meshes, **given)
+    if path == "transfer":
+        return Lighting(scene.environment, path, meshes=scene.meshes, **given)
+    content = (
+        path,
+        repr(sorted(given.items(), key=lambda item: item[0])),
+        *_content(vars(scene.environment)),
+    )
+    return _remembered(_LIGHTINGS, content, lambda: Lighting(scene.environment, path, **given), KEPT)
+
+
+def _remembered(store, key, make, most):
+    """What was made under a key; of old ones ``most`` are kept."""
+    if key not in store:
+        made = make()
+        while len(store) >= most:
+            store.pop(next(iter(store)))
+        store[key] = made
+    return store[key]
+
+
+def _content(*values):
+    """Keys of what dictionaries of arrays and facts hold, by content."""
+    digests = []
+    for value in values:
+        digest = hashlib.blake2b(digest_size=16)
+        for name in sorted(value):
+            entry = value[name]
+            if isinstance(entry, np.ndarray):
+                digest.update(f"{name} {entry.dtype} {entry.shape} ".encode())
+                digest.update(np.ascontiguousarray(entry))
+            else:
+                digest.update(f"{name} {entry!r} ".encode())
+        digests.append(digest.hexdigest())
+    return digests

@@ -90,13 +90,13 @@ class Settings:
     directions: str = "ubo81"
     estimator: str = "surface"
     spp: int = 16
-    size: int = 80
-    environment_size: int = 56
+    size: int = 72
+    environment_size: int = 48
     grid: int = 4
     environment_grid: int = 2
     truth_spp: int = 128
     environment_spp: int = 1024
-    port_pixels: int = 100
+    port_pixels: int = 64
     held_out_texels: int = 32
     chi2_samples: int = 1_000_000
     seed: int = 0
