@@ -13,7 +13,6 @@ from functools import cached_property
 
 import numpy as np
 
-from btfref.conventions import luminance
 from btfref.errors import InputError
 from btfref.numerics import harmonics
 from btfref.registry import image_light, methods
@@ -93,6 +92,8 @@ class Lighting:
         That damps their ringing.
     meshes : sequence of MeshDescription
         Of the scene, for the path "transfer".
+    delta : bool
+        Whether directional and point lights stand beside the environment: that path then draws them apart.
     transfer : btfref.render.transfer.TransferSettings, optional
         Of that path.
 
@@ -111,6 +112,7 @@ class Lighting:
         order=harmonic_light.ORDER,
         window=None,
         meshes=(),
+        delta=False,
         transfer=None,
     ):
         if path not in PATHS:
@@ -124,6 +126,7 @@ class Lighting:
         harmonics.window(window, order)
         self._meshes, self._transfer = tuple(meshes), transfer or TransferSettings()
         self._made = {}
+        self._delta = delta
 
     @cached_property
     def light_set(self):
@@ -150,11 +153,11 @@ class Lighting:
         settings = self._transfer
         if not settings.shadows:
             return None
-        albedo = [self._albedo(mesh) if settings.bounces else 0.0 for mesh in self._meshes]
+        albedo = [self._albedo(mesh) for mesh in self._meshes] if settings.bounces else ()
         return vertex_transfer(self._meshes, self._order, bounces=settings.bounces, albedo=albedo)
 
     def _albedo(self, mesh):
-        """Mean luminance of a material under radiance 1, over texels and views."""
+        """Mean colour of a material under radiance 1, over texels and views, shape (3,)."""
         from btfref import representations
 
         rep = representations.load(mesh.material.filename)
@@ -164,7 +167,7 @@ class Lighting:
         w_view /= np.linalg.norm(w_view, axis=1, keepdims=True)
         frame = np.broadcast_to(np.eye(3), (ALBEDO_SAMPLES, 3, 3))
         white = Lighting(constant(), "sh", order=1).prepared(rep)
-        return mesh.material.scale * float(luminance(white.radiance(uv, w_view, frame)).mean())
+        return mesh.material.scale * white.radiance(uv, w_view, frame).mean(0)
 
     def prepared(self, representation, *, file=None, mesh=None):
         """The way for a representation.
@@ -260,6 +263,13 @@ class Lighting:
             material, transfer, self.coefficients, two_sided=two_sided, bits=settings.bits
         )
         triangles, starts = transfer_light.bins(transfer, neighbours(mesh.positions, mesh.faces))
+        bin_numbers = list(range(len(starts) - 1))
+        if self._delta:
+            # One more bin with every triangle once, number −1, under the other lights.
+            every = np.zeros((len(mesh.faces), triangles.shape[1]), np.float32)
+            every[:, 0] = np.arange(len(mesh.faces))
+            triangles, starts = np.concatenate([triangles, every]), np.append(starts, starts[-1] + len(every))
+            bin_numbers.append(-1)
 
         def radiance(uv, w_view, to_world, evaluate=None, place=None):
             return light.radiance(uv, w_view, np.linalg.det(to_world) < 0, *place())
@@ -294,7 +304,9 @@ class Lighting:
             "TRANSFER_MATERIALS": len(material.present),
         }
         shader = representation.transfer_shader
-        passes = tuple({"bin": k, "bin_first": int(first)} for k, first in enumerate(starts[:-1]))
+        passes = tuple(
+            {"bin": k, "bin_first": int(first)} for k, first in zip(bin_numbers, starts[:-1], strict=True)
+        )
         return Prepared("transfer", shader, tables, radiance, facts, constants, passes, starts, light)
 
 
@@ -344,16 +356,10 @@ def lighting_of(scene, path="auto", **options):
     """
     if scene.environment is None:
         return None
-    if path == "transfer" and scene.lights:
-        raise InputError(
-            "transferred light is the environment's alone",
-            file=scene.source,
-            field="emitter",
-            got=len(scene.lights),
-        )
     given = {k: v for k, v in options.items() if v is not None}
     if path == "transfer":
-        return Lighting(scene.environment, path, meshes=scene.meshes, **given)
+        delta = bool(scene.lights)
+        return Lighting(scene.environment, path, meshes=scene.meshes, delta=delta, **given)
     content = (
         path,
         repr(sorted(given.items(), key=lambda item: item[0])),

@@ -43,7 +43,8 @@ class TransferSettings:
     shadows : bool
         Whether the scene's meshes hide the environment from each other and themselves.
     bounces : int
-        Of light from mesh to mesh, as from Lambertian surfaces of the materials' mean albedo; needs ``shadows``.
+        Of light from mesh to mesh, as from Lambertian surfaces of the materials' mean albedo, in colour; needs
+        ``shadows``.
     bits : {8, 32}
         Of a stored product: codes with four scales, or floats.
     seed : int
@@ -83,7 +84,8 @@ class ClusteredTransfer:
         Clusters that no corner has are left out.
     weights : ndarray of float32, shape (triangles, 3, 1 + components)
         The first is 1, of the cluster's mean.
-    basis : ndarray of float32, shape (clusters, 1 + components, order², order²)
+    basis : ndarray of float32, shape (clusters, 1 + components, channels, order², order²)
+        One channel where all three are alike; the weights are the same for all.
     error : float
         Relative RMS error of the matrices.
     """
@@ -110,18 +112,19 @@ def corner_matrices(mesh, order, transfer=None):
     ----------
     mesh : MeshDescription
     order : int
-    transfer : ndarray, shape (vertices, order², order²), optional
+    transfer : ndarray, shape (vertices, channels, order², order²), optional
         In world space: see :func:`vertex_transfer`. Without it nothing hides the environment.
 
     Returns
     -------
-    ndarray of float32, shape (triangles, 3, order², order²)
+    ndarray of float32, shape (triangles, 3, channels, order², order²)
     """
     frames = corner_frames(mesh)
-    result = np.zeros((*frames.shape[:2], order * order, order * order), np.float32)
+    channels = 1 if transfer is None else transfer.shape[1]
+    result = np.zeros((*frames.shape[:2], channels, order * order, order * order), np.float32)
     for first in range(0, len(frames), 2 * BLOCK):
         part = slice(first, first + 2 * BLOCK)
-        turn = harmonics.rotation_matrix(frames[part], order)
+        turn = harmonics.rotation_matrix(frames[part], order)[:, :, None]
         result[part] = turn if transfer is None else turn @ transfer[mesh.faces[part]]
     return result
 
@@ -136,15 +139,15 @@ def vertex_transfer(meshes, order, *, bounces=0, albedo=(), progress=None):
     order : int
     bounces : int
         Of light from mesh to mesh.
-    albedo : sequence of float
-        Of each mesh, grey, for those.
+    albedo : sequence of array_like, shape (3,)
+        Of each mesh, for those.
     progress : callable, optional
 
     Returns
     -------
-    list of ndarray of float32, shape (vertices, order², order²)
+    list of ndarray of float32, shape (vertices, channels, order², order²)
         World space: ``∫ V(w) y_i y_j dw``, and what other places send in place of what they hide. Surfaces reflect on
-        their front sides, two-sided ones on both.
+        their front sides, two-sided ones on both. One channel without bounces, else three.
 
     Raises
     ------
@@ -162,7 +165,8 @@ def vertex_transfer(meshes, order, *, bounces=0, albedo=(), progress=None):
     n = order * order
     direct = []
     # Radiance of the front and back sides per coefficient, all meshes' vertices in one list.
-    sent = np.zeros((starts[-1], 2, n), np.float32)
+    channels = 3 if bounces else 1
+    sent = np.zeros((channels, starts[-1], 2, n), np.float32)
     with mitsuba_variant("llvm_ad_rgb") as mi:
         scene = mi.load_dict(
             {"type": "scene", **{f"mesh_{i}": _mitsuba_mesh(mi, m, i) for i, m in enumerate(meshes)}}
@@ -176,18 +180,17 @@ def vertex_transfer(meshes, order, *, bounces=0, albedo=(), progress=None):
             # What is hidden is taken from the whole, so that nothing is lost where nothing is hidden.
             own[part] = np.eye(n, dtype=np.float32) - np.einsum("vd,di,dj->vij", blocked, y, y, optimize=True)
         direct.append(own)
-    total = [d.copy() for d in direct]
+    total = [np.repeat(d[:, None], channels, 1) for d in direct]
     lobe = [_diffuse(mesh, w, y) for mesh in meshes]
     for bounce in range(bounces):
         for i, mesh in enumerate(meshes):
             for side in (0, 1):
                 two = side == 0 or (mesh.material is not None and mesh.material.twosided)
-                scale = albedo[i] / np.pi if two else 0.0
-                sent[starts[i] : starts[i + 1], side] = scale * np.einsum(
-                    "vi,vij->vj", lobe[i][side], total[i]
-                )
+                scale = np.asarray(albedo[i], float) / np.pi * two
+                found = np.einsum("vi,vcij->cvj", lobe[i][side], total[i])
+                sent[:, starts[i] : starts[i + 1], side] = scale[:, None, None] * found
         for i in range(len(meshes)):
-            total[i] = direct[i] + _gathered(y, *hits[i], sent)
+            total[i] = np.stack([direct[i] + _gathered(y, *hits[i], own) for own in sent], 1)
         if progress:
             progress(bounce + 1, bounces, "light between meshes")
     return total
@@ -297,7 +300,7 @@ def clustered(matrices, settings):
 
     Parameters
     ----------
-    matrices : ndarray of float32, shape (triangles, 3, n, n)
+    matrices : ndarray of float32, shape (triangles, 3, channels, n, n)
     settings : TransferSettings
 
     Returns
@@ -306,7 +309,7 @@ def clustered(matrices, settings):
     """
     rng = np.random.default_rng(settings.seed)
     shape = matrices.shape
-    rows = matrices.reshape(-1, shape[2] * shape[3])
+    rows = matrices.reshape(shape[0] * shape[1], -1)
     # A plane has a single matrix: corners that are alike are clustered once.
     unique, inverse = np.unique(np.round(rows, 6), axis=0, return_inverse=True)
     inverse = inverse.reshape(-1)

@@ -83,7 +83,11 @@ def transferred(transfer, light, *, two_sided=False, components=None):
     ndarray of float32, shape (3, sides, clusters, 1 + components, order²)
     """
     basis = transfer.basis if components is None else transfer.basis[:, : components + 1]
-    found = np.einsum("kjab,bc->ckja", basis, np.asarray(light, np.float32), optimize=True)
+    light = np.asarray(light, np.float32)
+    if basis.shape[2] == 1:
+        found = np.einsum("kjab,bc->ckja", basis[:, :, 0], light, optimize=True)
+    else:
+        found = np.einsum("kjcab,bc->ckja", basis, light, optimize=True)
     sides = [found]
     if two_sided:
         order = int(np.sqrt(len(light)))

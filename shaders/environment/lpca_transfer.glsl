@@ -9,7 +9,7 @@ uniform sampler2DArray transfer_corners;   // [triangle, corner]: cluster, weigh
 uniform sampler2DArray transfer_scales;    // of codes: (j = 0, m = 0), (0, > 0), (> 0, 0), (> 0, > 0)
 uniform sampler2DArray transfer_clusters;  // place of each of the material's clusters among those that are present
 uniform int transfer_components;           // 1 + matrix components in the table: fewer while the light moves
-uniform int bin;                           // cluster that is drawn
+uniform int bin;                           // cluster that is drawn; -1: the other lights alone
 
 int transfer_triangle;         // set by the host
 vec3 transfer_barycentric;

@@ -56,9 +56,13 @@ void main() {
     fetches = 0;  // of the geometry
 #endif
     vec3 sum = vec3(0.0);
+#ifdef HAS_BINS
+    bool lit = bin < 0;  // Clusters' bins overlap: one of its own has every triangle once.
+#else
+    bool lit = pass == 0;  // Passes add up: the first one has them.
+#endif
 #if N_LIGHTS > 0
-    // Passes add up: the first one has them.
-    for (int i = 0; i < (pass == 0 ? N_LIGHTS : 0); ++i) {
+    for (int i = 0; i < (lit ? N_LIGHTS : 0); ++i) {
         vec3 towards;
         vec3 irradiance = light_incident(i, point.position, towards);
         vec3 w_light = to_local * towards;
@@ -73,8 +77,12 @@ void main() {
 #ifdef HAS_BINS
     transfer_triangle = point.triangle;
     transfer_barycentric = point.barycentric;
-#endif
+    if (!lit) {
+        sum += btf_environment(uv, w_view, to_world, lod);
+    }
+#else
     sum += btf_environment(uv, w_view, to_world, lod);
+#endif
 #endif
 #ifdef COUNT_FETCHES
     // Instead of coverage: the texels that the representation fetched.

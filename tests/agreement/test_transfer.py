@@ -126,8 +126,21 @@ def test_light_from_wall_to_wall(fits):
         return image[inside].mean(0)
 
     without, with_one = mean(0), mean(1)
-    assert with_one.sum() > without.sum()
-    assert abs(with_one.sum() - reference.sum()) < 0.5 * abs(without.sum() - reference.sum())
+    # In every channel: light takes the walls' colour.
+    assert (with_one > without).all()
+    assert (np.abs(with_one - reference) < 0.5 * np.abs(without - reference)).all()
+
+
+def test_light_between_meshes_has_the_walls_colour(fits):
+    """To the first bounce linear in the albedo, by channel; black walls send nothing."""
+    mesh = described(fits, "bowl").meshes[0]
+    (direct,) = vertex_transfer([mesh], 2)
+    (found,) = vertex_transfer([mesh], 2, bounces=1, albedo=[(0.9, 0.3, 0.0)])
+    assert found.shape == (len(mesh.positions), 3, 4, 4)
+    sent = found - direct
+    assert np.abs(sent[:, 0]).max() > 0.01
+    np.testing.assert_allclose(sent[:, 0], 3 * sent[:, 1], atol=1e-5)
+    np.testing.assert_allclose(sent[:, 2], 0, atol=1e-7)
 
 
 def test_more_clusters_and_components_compress_less(fits):
@@ -139,7 +152,7 @@ def test_more_clusters_and_components_compress_less(fits):
     ]
     assert errors[0] > errors[1] > errors[2]
     transfer = clustered(matrices, TransferSettings(clusters=8, components=6))
-    rebuilt = np.einsum("tcj,tcjab->tcab", transfer.weights, transfer.basis[transfer.cluster])
+    rebuilt = np.einsum("tcj,tcj...->tc...", transfer.weights, transfer.basis[transfer.cluster])
     found = np.sqrt(((rebuilt - matrices) ** 2).sum() / (matrices**2).sum())
     assert found == pytest.approx(transfer.error, rel=1e-3)
 
@@ -198,6 +211,14 @@ def test_settings_are_checked(fits):
     for wrong in ({"clusters": 0}, {"bits": 16}, {"bounces": 1}, {"components": 2.5}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             TransferSettings(**wrong)
-    lit = replace(described(fits, "plane"), lights=(Light("point", np.zeros(3), np.ones(3)),))
-    with pytest.raises(InputError, match="emitter"):
-        lighting_of(lit, "transfer")
+
+
+def test_other_lights_are_added_once(fits):
+    """A directional light beside the environment: bins overlap, the light does not."""
+    scene = described(fits, "cloth")
+    lit = replace(scene, lights=(Light("directional", np.array([0.36, -0.48, 0.8]), np.full(3, 2.0)),))
+    options = {"environment": "transfer", "order": 2, "grid": 1, "transfer": TransferSettings(clusters=5)}
+    alone, both = (realtime(s, **options).image for s in (scene, lit))
+    light = realtime(replace(lit, environment=None), grid=1).image
+    assert light.max() > 0.1 * alone.max() > 0
+    np.testing.assert_allclose(both, alone + light, rtol=1e-5, atol=1e-6 * both.max())

@@ -1,0 +1,90 @@
+"""Under radiance 1 from everywhere a picture is its own albedo: every method, three scenes, against quadrature.
+
+The albedo of a method with levels of detail is that of what a pixel shows: the integral over the hemisphere of the B
+that the sample's footprint filters, with its level and its probes along the footprint, and not the finest level's.
+"""
+
+import numpy as np
+import pytest
+
+from btfref.compare.tolerances import tolerance
+from btfref.numerics.quadrature import gauss_hemisphere
+from btfref.registry import methods
+from btfref.render.approximate import approximate
+from btfref.render.classes import pixel_classes
+from btfref.render.lighting import Lighting, Prepared
+from btfref.render.realtime import realtime
+from btfref.scenes import scene_file
+
+SIZE = (20, 20)
+SCENES = ("plane", "sphere", "cloth")
+
+#: Lights of the constant environment: a rule of the second order with steps of 3 degrees.
+LIGHTS = 4096
+
+#: Of the picture's points every one of these is integrated, and so many of them at a time.
+EVERY, STEP = 7, 16
+
+#: In the default run: the sphere, and all scenes of the method that has levels of detail.
+CELLS = [
+    pytest.param(
+        key,
+        scene,
+        marks=[] if scene == "sphere" or key == "laplacian" else [pytest.mark.long],
+        id=f"{key}-{scene}",
+    )
+    for key in methods()
+    for scene in SCENES
+]
+
+
+@pytest.fixture(autouse=True)
+def _renderers(need):
+    need("llvm"), need("gl")
+
+
+def albedo(uv, w_view, to_world, evaluate=None, place=None):
+    """The integral of B over the hemisphere of the light, as of :class:`Prepared`; NaN where it is not computed."""
+    w, weight = gauss_hemisphere(48, 96)
+    result = np.full((len(uv), 3), np.nan)
+    some = np.arange(0, len(uv), EVERY)
+    for first in range(0, len(some), STEP):
+        at = some[first : first + STEP]
+        point, light = np.repeat(at, len(w)), np.tile(np.arange(len(w)), len(at))
+        value = evaluate(uv[point], w[light], w_view[point], point).reshape(len(at), len(w), 3)
+        result[at] = np.einsum("l,nlc->nc", weight, value)
+    return result
+
+
+@pytest.mark.parametrize(("key", "scene"), CELLS)
+def test_a_constant_environment_shows_the_albedo(fits, monkeypatch, key, scene):
+    parameters = {"btf": str(fits.path(key)), "lights": "constant"}
+    settings = {"parameters": parameters, "grid": 1, "size": SIZE}
+    file = scene_file(scene)
+    image = realtime(file, environment="lights", lights=LIGHTS, **settings)
+    assert image.meta["environment_lights"] == LIGHTS
+    monkeypatch.setattr(Lighting, "prepared", lambda *_, **__: Prepared("lights", "", {}, albedo))
+    exact = approximate(file, path="lights", **settings).image
+    inside = (pixel_classes(file, **settings) == 1) & np.isfinite(exact).all(-1)
+    assert inside.sum() > 8
+    assert exact[inside].min() > 0
+    difference = np.abs(image.image - exact)[inside].max()
+    assert difference <= tolerance("environment.furnace.max") * exact[inside].max(), (
+        difference / exact[inside].max()
+    )
+
+
+def test_levels_have_albedos_of_their_own(fits, monkeypatch):
+    """What the finest level reflects is not what a distant pixel must show: the test above can tell them apart."""
+    parameters = {"btf": str(fits.path("laplacian")), "lights": "constant", "tiling": "16"}
+    settings = {"parameters": parameters, "grid": 1, "size": SIZE, "path": "lights"}
+    file = scene_file("plane")
+    monkeypatch.setattr(Lighting, "prepared", lambda *_, **__: Prepared("lights", "", {}, albedo))
+    filtered = approximate(file, **settings).image
+    inside = np.isfinite(filtered).all(-1)
+    rep = fits("laplacian")
+    finest = lambda uv, w_light, w_view, _: rep.evaluate(uv, w_light, w_view)  # noqa: E731
+    fine = lambda uv, w_view, to_world, *_: albedo(uv, w_view, to_world, finest)  # noqa: E731
+    monkeypatch.setattr(Lighting, "prepared", lambda *_, **__: Prepared("lights", "", {}, fine))
+    difference = np.abs(approximate(file, **settings).image - filtered)[inside].max()
+    assert difference > 10 * tolerance("environment.furnace.max") * filtered[inside].max()
