@@ -155,6 +155,8 @@ def test_pictures_equal_float64(under_sky, fits, tables, monkeypatch, key):
     parameters = under_sky(key)
     _, own = tables(key, fits(key), "sky")
     monkeypatch.setattr(image_light(key), "tables", classmethod(lambda *_: own))
+    # Smaller maps must not be remembered for other tests.
+    monkeypatch.setattr(lighting, "_LIGHTINGS", {})
     classes = pixel_classes(SPHERE, parameters=parameters, grid=1, size=SIZE)
     image = realtime(read_scene(SPHERE, parameters, size=SIZE), grid=1)
     assert image.meta["environment"] == "envmap"
@@ -211,6 +213,7 @@ def test_lights_and_environment_add_up(fits, tables, monkeypatch, llvm):
     """A sun and a constant sky in one scene give the sum of their pictures."""
     _, own = tables("rf_lobes", fits("rf_lobes"), "constant")
     monkeypatch.setattr(image_light("rf_lobes"), "tables", classmethod(lambda *_: own))
+    monkeypatch.setattr(lighting, "_LIGHTINGS", {})
     llvm.set_variant("scalar_rgb")
     look = llvm.ScalarTransform4f().look_at([0.5, -2, 2], [0, 0, 0], [0, 0, 1])
     film = {"type": "hdrfilm", "width": 24, "height": 24}
