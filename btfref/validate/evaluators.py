@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-import tempfile
-from contextlib import chdir
-
 import numpy as np
 
 from btfref.compare.comparison import agreement
 from btfref.compare.gates import Measured, judge
-from btfref.compare.tolerances import tolerance
-from btfref.validate.probes import hit_allowance, probe_points
+from btfref.validate.probes import hit_allowance, probe_points, unit
+from btfref.validate.sampling import chi_square, surface
+
+#: Gates of a method on its own.
+GATES = ("probe.agreement", "probe.finite", "chi2.rejected", "sample.weight", "sample.pdf")
 
 #: Lookups of each evaluator.
 PROBES = 8000
 
 #: Texture coordinates and views of the χ² tests: a texel's middle and a place between texels, steep and grazing.
 UVS = ((0.31, 0.47), (0.83, 0.12))
-VIEWS = {"normal": (0.0, 0.0, 1.0), "oblique": (0.5, -0.4, 0.77), "grazing": (0.1, 0.99, 0.08)}
+VIEWS = {
+    name: np.array(w)
+    for name, w in {
+        "normal": (0.0, 0.0, 1.0),
+        "oblique": (0.5, -0.4, 0.77),
+        "grazing": (0.1, 0.99, 0.08),
+    }.items()
+}
 
 
 def probe_gates(path, *, seed=7):
@@ -66,7 +73,7 @@ def _named(gate, whose):
     return replace(gate, detail=f"{whose}{': ' if gate.detail else ''}{gate.detail}")
 
 
-def sampling_gates(path, *, samples):
+def sampling_gates(path, *, samples, altered=None):
     """χ² of `sample()` against `pdf()`, and its weights against value over density.
 
     Parameters
@@ -75,27 +82,26 @@ def sampling_gates(path, *, samples):
         A representation.
     samples : int
         Of each of the tests; their significance is Šidák-corrected.
+    altered : callable, optional
+        ``plugin -> plugin``: a fault.
 
     Returns
     -------
     list of GateResult
-        ``chi2`` with the smallest p-value's test, ``sample.weight``, ``sample.pdf``.
+        ``chi2.rejected``, ``sample.weight``, ``sample.pdf``.
     """
     mi, plugin = _plugin(path)
-    results, weights, pdfs = [], [], []
-    with (
-        tempfile.TemporaryDirectory() as scratch,
-        chdir(scratch),
-    ):  # the test writes its tables where it stands
-        for name, view in VIEWS.items():
-            w_view = np.asarray(view) / np.linalg.norm(view)
-            for uv in UVS:
-                results.append((f"{name} view, uv {uv}", *_chi2(mi, plugin, uv, w_view, samples)))
-                weight, pdf = _weights(mi, plugin, uv, w_view)
-                weights.append(weight)
-                pdfs.append(pdf)
-    failed = [f"{where}: {message}" for where, right, message in results if not right]
-    detail = "; ".join(failed) or f"{len(results)} tests of {samples} samples"
+    plugin = altered(plugin) if altered else plugin
+    failed, weights, pdfs = [], [], []
+    places = [(name, unit(view), uv) for name, view in VIEWS.items() for uv in UVS]
+    for name, w_view, uv in places:
+        right, message = chi_square(mi, plugin, uv, w_view, samples=samples, tests=len(places))
+        if not right:
+            failed.append(f"{name} view, uv {uv}: {message}")
+        weight, pdf = _weights(mi, plugin, uv, w_view)
+        weights.append(weight)
+        pdfs.append(pdf)
+    detail = "; ".join(failed) or f"{len(places)} tests of {samples} samples"
     rejected = Measured(len(failed), "fail" if failed else "pass", detail)
     return [
         *judge("chi2.rejected", {"tests": rejected}),
@@ -104,35 +110,10 @@ def sampling_gates(path, *, samples):
     ]
 
 
-def _chi2(mi, plugin, uv, w_view, samples):
-    """Whether one χ² test passes, and what it says if not."""
-    import drjit as dr
-
-    context = mi.BSDFContext()
-
-    def sample(s):
-        bs, _ = plugin.sample(context, _place(mi, dr.width(s), uv, w_view), s[0], mi.Point2f(s[1], s[2]))
-        return bs.wo, dr.select(bs.pdf > 0, mi.Float(1), 0)
-
-    def pdf(w):
-        return plugin.pdf(context, _place(mi, dr.width(w), uv, w_view), w)
-
-    test = mi.chi2.ChiSquareTest(
-        domain=mi.chi2.SphericalDomain(),
-        sample_func=sample,
-        pdf_func=pdf,
-        sample_dim=3,
-        sample_count=samples,
-        ires=16,
-    )
-    right = test.run(tolerance("chi2.significance"), test_count=len(UVS) * len(VIEWS), quiet=True)
-    return bool(right), " ".join(str(test.messages).split())[-200:]
-
-
 def _weights(mi, plugin, uv, w_view, n=1 << 13):
     """Largest error of weight × density against the value, and of the density, relative."""
     rng, context = np.random.default_rng(5), mi.BSDFContext()
-    si = _place(mi, n, uv, w_view)
+    si = surface(mi, n, uv, w_view)
     bs, weight = plugin.sample(context, si, mi.Float(rng.random(n)), mi.Point2f(rng.random((2, n))))
     value, pdf = np.array(plugin.eval(context, si, bs.wo)), np.array(plugin.pdf(context, si, bs.wo))
     floor = 1e-3 * max(float(np.abs(value).max()), 1e-30)
@@ -153,13 +134,3 @@ def _plugin(path, **parameters):
         parsing.use_variant("llvm_ad_rgb")
     mitsuba_plugins.register()
     return mi, mi.load_dict({"type": "btf", "filename": str(path), **parameters})
-
-
-def _place(mi, n, uv, w_view):
-    import drjit as dr
-
-    si = dr.zeros(mi.SurfaceInteraction3f, n)
-    # Data, not code: one kernel serves all places.
-    si.uv = mi.Point2f(*(dr.opaque(mi.Float, float(x)) for x in uv))
-    si.wi = mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in w_view))
-    return si

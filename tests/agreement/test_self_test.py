@@ -5,7 +5,8 @@ import json
 import pytest
 
 from btfref.cli import main
-from btfref.validate.self_test import FAULTS, self_test
+from btfref.validate.faults import FAULTS
+from btfref.validate.self_test import entries, self_test, used_gates
 
 
 @pytest.fixture(autouse=True)
@@ -14,11 +15,21 @@ def _renderers(need):
     need("gl")
 
 
+def test_every_gate_has_a_fault():
+    """All gates that validation applies are known, and each has a fault that is meant for it."""
+    meant = {fault.meant for fault in FAULTS}
+    assert meant <= entries(used_gates())
+    assert {name.rpartition(".")[0] for name in meant} == used_gates()
+    assert len({fault.name for fault in FAULTS}) == len(FAULTS)
+
+
 def test_every_fault_is_caught_by_its_gate():
+    """And every single limit is failed by some fault."""
     found = self_test()
-    assert len(found) == len(FAULTS) == 12
-    assert [fault.name for fault in found if not fault.caught] == []
-    assert [fault.clean for fault in found if fault.clean] == []
+    assert len(found) == len(FAULTS)
+    assert [(fault.name, fault.failed) for fault in found if not fault.caught] == []
+    assert [(fault.name, fault.clean) for fault in found if fault.clean] == []
+    assert entries(used_gates()) - {name for fault in found for name in fault.failed} == set()
 
 
 @pytest.mark.long

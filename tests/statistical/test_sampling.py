@@ -7,6 +7,7 @@ from oracle import oracle_btf
 from btfref.compare.tolerances import tolerance
 from btfref.registry import methods
 from btfref.representations import save
+from btfref.validate.sampling import chi_square, surface
 
 UVS = ((0.1, 0.2), (0.72, 0.35), (0.5, 0.5), (0.3, 0.8), (0.9, 0.93))
 VIEWS = {"normal": (0, 0, 1), "oblique": (0.6, 0.2, 0.7), "grazing": (0.9, -0.3, 0.02)}
@@ -45,49 +46,17 @@ def test_these_methods_have_lobes_of_their_own(llvm):
     assert having == set(OWN)
 
 
-def interaction(mi, n, uv, w_view):
-    import drjit as dr
-
-    si = dr.zeros(mi.SurfaceInteraction3f, n)
-    si.uv, si.wi = mi.Point2f(uv), mi.Vector3f(w_view)
-    return si
-
-
 def unit(w):
     return np.array(w, float) / np.linalg.norm(w)
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_samples_follow_the_density(case, view, llvm, tmp_path, monkeypatch):
+def test_samples_follow_the_density(case, view, llvm):
     """χ² of a million samples; significance Šidák-corrected over all tests of this function."""
-    import drjit as dr
-
-    # On failure the test class writes its tables into the working directory.
-    monkeypatch.chdir(tmp_path)
-    mi = llvm
-    bsdf, context = load(mi, case[0], **case[1]), mi.BSDFContext()
-    w_view = unit(VIEWS[view])
+    bsdf, n_tests = load(llvm, case[0], **case[1]), len(VIEWS) * len(UVS) * len(CASES)
     for uv in UVS:
-
-        def sample(s, uv=uv):
-            bs, _ = bsdf.sample(
-                context, interaction(mi, dr.width(s), uv, w_view), s[0], mi.Point2f(s[1], s[2])
-            )
-            return bs.wo, dr.select(bs.pdf > 0, mi.Float(1), 0)
-
-        def pdf(w, uv=uv):
-            return bsdf.pdf(context, interaction(mi, dr.width(w), uv, w_view), w)
-
-        test = mi.chi2.ChiSquareTest(
-            domain=mi.chi2.SphericalDomain(),
-            sample_func=sample,
-            pdf_func=pdf,
-            sample_dim=3,
-            sample_count=SAMPLES,
-            ires=16,
-        )
-        n_tests = len(VIEWS) * len(UVS) * len(CASES)
-        assert test.run(tolerance("chi2.significance"), test_count=n_tests, quiet=True), test.messages
+        right, message = chi_square(llvm, bsdf, uv, unit(VIEWS[view]), samples=SAMPLES, tests=n_tests)
+        assert right, message
 
 
 def grid(n_theta=192, n_phi=384):
@@ -113,7 +82,7 @@ def test_density_integrates_to_one(case, view, llvm):
     mi = llvm
     bsdf = load(mi, case[0], **case[1])
     w, solid_angle = grid()
-    si = interaction(mi, len(UVS) * len(w), np.repeat(UVS, len(w), 0).T, unit(VIEWS[view]))
+    si = surface(mi, len(UVS) * len(w), np.repeat(UVS, len(w), 0).T, unit(VIEWS[view]))
     pdf = np.array(bsdf.pdf(mi.BSDFContext(), si, mi.Vector3f(np.tile(w, (len(UVS), 1)).T)))
     integral = pdf.reshape(len(UVS), -1) @ solid_angle
     assert np.abs(integral - 1).max() <= tolerance("pdf.integral.max")
@@ -124,7 +93,7 @@ def test_weight_is_value_over_density(case, view, llvm, rng):
     """sample() returns eval/pdf and its own pdf(); eval_pdf() is the pair of both."""
     mi = llvm
     bsdf, context, n = load(mi, case[0], **case[1]), mi.BSDFContext(), len(UVS) << 15
-    si = interaction(mi, n, np.repeat(UVS, 1 << 15, 0).T, unit(VIEWS[view]))
+    si = surface(mi, n, np.repeat(UVS, 1 << 15, 0).T, unit(VIEWS[view]))
     bs, weight = bsdf.sample(context, si, mi.Float(rng.random(n)), mi.Point2f(rng.random((2, n))))
     value, pdf = bsdf.eval(context, si, bs.wo), np.array(bsdf.pdf(context, si, bs.wo))
     both = bsdf.eval_pdf(context, si, bs.wo)
@@ -154,7 +123,7 @@ def test_variance_is_at_most_that_of_cosine_sampling(case, view, llvm):
     guided, cosine = load(mi, case[0]), load(mi, case[0], sampling="cosine")
     w, solid_angle = grid(48, 128)
     uv = np.random.default_rng(11).random((N_VARIANCE_TEXELS, 2))
-    si = interaction(mi, len(uv) * len(w), np.repeat(uv, len(w), 0).T, unit(VIEWS[view]))
+    si = surface(mi, len(uv) * len(w), np.repeat(uv, len(w), 0).T, unit(VIEWS[view]))
     w_light = mi.Vector3f(np.tile(w, (len(uv), 1)).T)
 
     def table(values):
@@ -182,66 +151,37 @@ def test_lambertian_is_sampled_as_by_cosine(llvm, tmp_path):
     bsdf = load(mi, tmp_path / "flat.raw.exr")
     w, _ = grid(32, 64)
     pdf = np.array(
-        bsdf.pdf(
-            mi.BSDFContext(), interaction(mi, len(w), (0.4, 0.4), unit((0.3, 0.1, 0.9))), mi.Vector3f(w.T)
-        )
+        bsdf.pdf(mi.BSDFContext(), surface(mi, len(w), (0.4, 0.4), unit((0.3, 0.1, 0.9))), mi.Vector3f(w.T))
     )
     np.testing.assert_allclose(pdf, w[:, 2] / np.pi, rtol=tolerance("sample.lambert.max"))
 
 
-def test_a_wrong_density_is_caught(fits, llvm, tmp_path, monkeypatch):
+def test_a_wrong_density_is_caught(fits, llvm):
     """The χ² test rejects samples of one view against the density of another."""
-    import drjit as dr
-
-    monkeypatch.chdir(tmp_path)
-    mi = llvm
-    bsdf, context = load(mi, fits.path("lpca")), mi.BSDFContext()
-    test = mi.chi2.ChiSquareTest(
-        domain=mi.chi2.SphericalDomain(),
-        sample_func=lambda s: (
-            bsdf.sample(
-                context, interaction(mi, dr.width(s), UVS[0], unit((0, 0, 1))), s[0], mi.Point2f(s[1], s[2])
-            )[0].wo,
-            mi.Float(1),
-        ),
-        pdf_func=lambda w: bsdf.pdf(context, interaction(mi, dr.width(w), UVS[0], unit((0.3, 0, 1))), w),
-        sample_dim=3,
-        sample_count=SAMPLES,
-        ires=16,
-    )
-    assert not test.run(tolerance("chi2.significance"), quiet=True)
+    bsdf = load(llvm, fits.path("lpca"))
+    right, _ = chi_square(llvm, bsdf, UVS[0], (0, 0, 1), samples=SAMPLES, pdf_view=unit((0.3, 0, 1)))
+    assert not right
 
 
 @pytest.mark.parametrize("lod", [0.5, 1.0, 2.3, 3.0, 4.0])
-def test_sampling_at_every_level_of_detail(fits, lod, llvm, tmp_path, monkeypatch):
+def test_sampling_at_every_level_of_detail(fits, lod, llvm):
     """χ² with the density, weights that are value over density, and no more variance than cosine sampling."""
     import drjit as dr
 
-    monkeypatch.chdir(tmp_path)
     mi, path = llvm, fits.path("laplacian")
     bsdf, context = load(mi, path, lod="none", lod_bias=lod), mi.BSDFContext()
     w_view = unit(VIEWS["oblique"])
 
-    def sample(s):
-        si = interaction(mi, dr.width(s), UVS[1], w_view)
-        bs, weight = bsdf.sample(context, si, s[0], mi.Point2f(s[1], s[2]))
+    def weighed(si, bs, weight):
         value = bsdf.eval(context, si, bs.wo)
         allowed = tolerance("sample.weight.max") * dr.maximum(dr.abs(value), 1e-4)
-        right = dr.all(dr.abs(weight * bs.pdf - value) <= allowed)
-        return bs.wo, dr.select((bs.pdf > 0) & right, mi.Float(1), 0)
+        return dr.all(dr.abs(weight * bs.pdf - value) <= allowed)
 
-    test = mi.chi2.ChiSquareTest(
-        domain=mi.chi2.SphericalDomain(),
-        sample_func=sample,
-        pdf_func=lambda w: bsdf.pdf(context, interaction(mi, dr.width(w), UVS[1], w_view), w),
-        sample_dim=3,
-        sample_count=SAMPLES,
-        ires=16,
-    )
-    assert test.run(tolerance("chi2.significance"), test_count=5, quiet=True), test.messages
+    right, message = chi_square(mi, bsdf, UVS[1], w_view, samples=SAMPLES, tests=5, counts=weighed)
+    assert right, message
     w, solid_angle = grid(48, 128)
     uv = np.random.default_rng(11).random((32, 2))
-    si = interaction(mi, len(uv) * len(w), np.repeat(uv, len(w), 0).T, w_view)
+    si = surface(mi, len(uv) * len(w), np.repeat(uv, len(w), 0).T, w_view)
     w_light = mi.Vector3f(np.tile(w, (len(uv), 1)).T)
     value = np.array(bsdf.eval(context, si, w_light), float).reshape(3, len(uv), len(w)).mean(0)
     density = np.array(bsdf.pdf(context, si, w_light), float).reshape(len(uv), len(w))

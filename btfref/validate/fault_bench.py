@@ -1,0 +1,217 @@
+"""Where known faults are looked for: one small material, fitted and rendered when needed."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property
+
+import numpy as np
+
+from btfref.compare import compare
+from btfref.compare.colour import fit_display
+from btfref.compare.comparison import agreement
+from btfref.compare.gates import Measured, judge
+from btfref.compare.waterfall import Picture, waterfall
+from btfref.scenes import scene_file
+from btfref.validate.cell import ENVIRONMENT_GATES, GATES
+from btfref.validate.evaluators import sampling_gates
+from btfref.validate.own_renderer import EIGHT_BIT, NOISY
+from btfref.validate.probes import hemisphere, probe_points
+
+#: The picture of the faults of the host: a curved surface seen from both sides, and more than one light.
+SCENE, LIGHTS = "cloth", "directional3"
+SETTINGS = {"grid": 4, "size": (48, 48)}
+
+#: Method → environment: few lights for the one, the maps alone for the other.
+ENVIRONMENTS = {"lpca": "bright-texel", "rf_lobes": "constant"}
+
+#: Samples of each of the six tests.
+CHI2_SAMPLES = 200_000
+
+
+class Altered:
+    """A plugin whose sampling is wrong in one way: ``density``, ``weight`` or ``pdf``."""
+
+    def __init__(self, plugin, change):
+        self._plugin, self._change = plugin, change
+        self.eval = plugin.eval
+
+    def pdf(self, context, si, w, active=True):
+        """The density, or that of a view that is turned by half a circle."""
+        if self._change == "density":
+            si = type(si)(si)
+            si.wi.x, si.wi.y = -si.wi.x, -si.wi.y
+        return self._plugin.pdf(context, si, w, active)
+
+    def sample(self, context, si, *numbers):
+        """A sample whose weight, or whose density, is a hundredth too large."""
+        bs, weight = self._plugin.sample(context, si, *numbers)
+        if self._change == "pdf":
+            bs.pdf *= 1.01
+        return bs, weight * (1.01 if self._change == "weight" else 1.0)
+
+
+class Bench:
+    """Where faults are looked for: one small material, fitted when needed."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self._fits, self._clean, self._references = {}, {}, {}
+
+    @cached_property
+    def btf(self):
+        """The material: a formula with bumps, 16² texels and 81² directions."""
+        from btfref.numerics.directions import directions
+        from btfref.sampling import SampledBTF
+        from btfref.stress.data import bumpy_values
+
+        views = directions("ubo81")
+        values = bumpy_values((16, 16), views, views).astype(np.float16)
+        return SampledBTF(values, views, views, attributes={"mesostructure": "formula"})
+
+    def fit(self, subject):
+        """The representation and its file."""
+        from btfref.registry import method as row
+        from btfref.representations import load, save
+
+        if subject not in self._fits:
+            key, parameters = subject
+            path = self.folder / f"formula{len(self._fits)}.{key}.exr"
+            save(row(key).fit(self.btf, **dict(parameters)), path)
+            self._fits[subject] = load(path), path
+        return self._fits[subject]
+
+    def clean(self, fault):
+        """The gates without the fault, looked at once."""
+        key = fault.look, fault.subject
+        if key not in self._clean:
+            self._clean[key] = getattr(self, fault.look)(fault.subject)
+        return self._clean[key]
+
+    def reference(self, subject):
+        """Scene, parameters, reference picture and pixel classes."""
+        from btfref.render.classes import pixel_classes
+        from btfref.render.reference import render
+
+        if subject not in self._references:
+            scene, size, grid = scene_file(SCENE), SETTINGS["size"], SETTINGS["grid"]
+            parameters = {"btf": str(self.fit(subject)[1]), "lights": LIGHTS, "tiling": "4"}
+            image = render(scene, parameters=parameters, noise_free=grid, shadows=False, size=size).image
+            classes = pixel_classes(scene, parameters=parameters, grid=grid, size=size)
+            self._references[subject] = scene, parameters, image, classes
+        return self._references[subject]
+
+    def picture(self, subject, change=""):
+        """Real time against the reference; the fault without a shader is light where nothing is."""
+        from btfref.render.realtime import realtime
+
+        scene, parameters, expected, classes = self.reference(subject)
+        image = realtime(scene, parameters=parameters, **SETTINGS).image
+        if change == "background":
+            image = np.where(classes[..., None] == 0, image + 0.01, image)
+        return compare(image, expected, classes=classes, gate=GATES, flip=False).gates
+
+    def environment(self, subject, change=""):
+        """Real time under an environment against a converged reference."""
+        from btfref.render.classes import pixel_classes
+        from btfref.render.converged import converged
+        from btfref.render.realtime import realtime
+
+        parameters = {"btf": str(self.fit(subject)[1]), "lights": "envmap", "tiling": "4"}
+        parameters["environment"] = ENVIRONMENTS[subject[0]]
+        scene, shared = scene_file("sphere"), {"parameters": parameters, "grid": 2, "size": (24, 24)}
+        made = realtime(scene, **shared)
+        gates = ENVIRONMENT_GATES[made.meta["environment_path"]]
+        key = subject, "environment"
+        if key not in self._references:
+            classes = pixel_classes(scene, **shared)
+            found = converged(scene, classes == 1, gate=gates[0], shadows=False, **shared)
+            self._references[key] = found, classes
+        (reference, classes), image = self._references[key], made.image.copy()
+        if change == "tile":
+            image[8:16, 8:16] *= 1.1
+        return compare(image, reference, classes=classes, gate=gates, flip=False).gates
+
+    def sampling(self, subject, change=""):
+        """Samples of the plugin against its density and its values."""
+        altered = (lambda plugin: Altered(plugin, change)) if change else None
+        return sampling_gates(self.fit(subject)[1], samples=CHI2_SAMPLES, altered=altered)
+
+    def batches(self, subject, change=""):
+        """A waterfall of one stage from noisy batches; the fault is a batch that is another once more."""
+        _, _, expected, classes = self.reference(subject)
+        rng, scale = np.random.default_rng(14), float(expected[classes == 1].mean())
+        noise = 0.2 * scale * rng.normal(size=(4, *expected.shape))
+        if change == "shared":
+            noise[1] = noise[0]
+        chain = [Picture("truth", expected + noise), Picture("stage", 1.02 * expected[None])]
+        return waterfall(chain, classes == 1, fit_display(expected, classes > 0)).gates
+
+    def noisy(self, subject, change=""):
+        """A picture against a reference with known noise."""
+        _, _, expected, classes = self.reference(subject)
+        rng, scale = np.random.default_rng(15), float(expected[classes == 1].mean())
+        sigma = 0.01 * scale
+        reference = expected + sigma * rng.normal(size=expected.shape)
+        image = 1.05 * expected if change == "bright" else expected
+        variance = np.full(expected.shape, sigma**2)
+        return compare(image, reference, classes=classes, gate=NOISY, variance=variance, flip=False).gates
+
+    def probes(self, subject):
+        """The shader against the definition, at all levels of detail where there are any."""
+        from btfref.render.probe import probe
+
+        representation, _ = self.fit(subject)
+        rng = np.random.default_rng(11)
+        points = probe_points(rng, 4000, self.btf.views, self.btf.lights)
+        lod = rng.uniform(0, getattr(representation, "max_lod", 0), len(points[0])).astype(np.float32)
+        value = probe(representation, *points, lod)
+        return [
+            *agreement(value, representation.evaluate(*points, lod=lod)).gates,
+            *judge("probe.finite", {"nonfinite": int(np.count_nonzero(~np.isfinite(value)))}),
+        ]
+
+    def harmonics(self, subject):
+        """The shader under an environment in spherical harmonics against float64."""
+        from btfref.render.environments import shipped
+        from btfref.render.lighting import Lighting
+        from btfref.render.probe import probe_environment
+
+        rng = np.random.default_rng(12)
+        frame = np.linalg.qr(rng.normal(size=(500, 3, 3)))[0]
+        frame[:, :, 2] *= np.linalg.det(frame)[:, None]
+        points = (
+            rng.uniform(-1, 2, (500, 2)).astype(np.float32),
+            hemisphere(rng, 500),
+            frame.astype(np.float32),
+        )
+        representation, _ = self.fit(subject)
+        light = Lighting(shipped("studio"), "sh", order=5).prepared(representation)
+        value = probe_environment(representation, light, *points)
+        return agreement(value, light.radiance(*points), gate="environment.agreement").gates
+
+    def eight_bits(self, subject, change=""):
+        """A picture that went through an 8-bit file; the faults are codes taken for radiance, and a pixel's shift."""
+        from btfref.compare.colour import decode_srgb, encode_srgb
+
+        _, _, expected, classes = self.reference(subject)
+        shown = np.clip(expected, 0, 1)
+        codes = np.rint(255 * encode_srgb(shown)) / 255
+        image = codes if change == "linear" else decode_srgb(codes)
+        if change == "shifted":
+            image = np.roll(image, 1, axis=1)
+        return compare(image, shown, classes=classes, gate=EIGHT_BIT, flip=False).gates
+
+    def overflow(self, subject, change=""):
+        """Maps as halves on their way to the shader; the fault scales them beyond 65504 and lets it happen."""
+        from btfref.render.probe import probe
+
+        representation, _ = self.fit(subject)
+        if change:
+            name = max(representation.maps, key=lambda n: representation.maps[n].size)
+            with np.errstate(over="ignore"):
+                large = (representation.maps[name].astype(np.float32) * 1e6).astype(np.float16)
+            representation = dataclasses.replace(representation, maps={**representation.maps, name: large})
+        points = probe_points(np.random.default_rng(13), 2000, self.btf.views, self.btf.lights)
+        bad = int(np.count_nonzero(~np.isfinite(probe(representation, *points))))
+        return judge("probe.finite", {"nonfinite": Measured(bad)})

@@ -1,0 +1,172 @@
+"""Known faults, and the limit that is meant for each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault and what is to catch it.
+
+    Parameters
+    ----------
+    name : str
+    meant : str
+        The limit that must fail: gate and entry.
+    look : str
+        Method of `btfref.validate.fault_bench.Bench` that looks for faults of this kind and returns gates.
+    method : str
+        Registry key of what is looked at.
+    edit : tuple of str, optional
+        Shader file, right text, wrong text.
+    change : str, optional
+        What the look itself does wrong, where no shader is at fault.
+    parameters : tuple of (str, value), optional
+        Of the fit.
+    """
+
+    name: str
+    meant: str
+    look: str
+    method: str = "lpca"
+    edit: tuple = ()
+    change: str = ""
+    parameters: tuple = ()
+
+    @property
+    def subject(self):
+        """What is fitted: method and parameters."""
+        return self.method, self.parameters
+
+
+HOST = "hosts/mesh.frag"
+SUM = "vec4(scale * sum, 1.0)"
+NOISE_FREE, PROBE = "image.noise_free.p999", "probe.agreement.p999"
+
+FAULTS = (
+    Fault(
+        "cosine dropped",
+        NOISE_FREE,
+        "picture",
+        edit=(HOST, "irradiance * btf", "irradiance / max(w_light.z, 1e-4) * btf"),
+    ),
+    Fault(
+        "light and view swapped",
+        NOISE_FREE,
+        "picture",
+        edit=(HOST, "btf_eval(uv, w_light, w_view", "btf_eval(uv, w_view, w_light"),
+    ),
+    Fault("v flipped", NOISE_FREE, "picture", edit=(HOST, "btf_eval(uv,", "btf_eval(vec2(uv.x, -uv.y),")),
+    Fault(
+        "half-texel shift",
+        PROBE,
+        "probes",
+        edit=("lib/texels.glsl", "float(columns), 0.5)", "float(columns), 0.0)"),
+    ),
+    Fault("wrong gamma", NOISE_FREE, "picture", edit=(HOST, SUM, "vec4(pow(max(sum, 0.0), vec3(2.2)), 1.0)")),
+    Fault(
+        "tangent frame transposed",
+        NOISE_FREE,
+        "picture",
+        edit=("lib/frame.glsl", "return transpose(mat3(", "return (mat3("),
+    ),
+    Fault(
+        "wrong sign in spherical harmonics",
+        "environment.agreement.p999",
+        "harmonics",
+        edit=("lib/harmonics.glsl", "turn.x * q - turn.y * p;", "turn.x * q + turn.y * p;"),
+    ),
+    Fault(
+        "cluster index off by one",
+        PROBE,
+        "probes",
+        edit=(
+            "representations/lpca.glsl",
+            "int first = int(table_fetch(cluster, texel * CLUSTER_STRIDE).r) * BASIS_DIM1;",
+            "int first = max(int(table_fetch(cluster, texel * CLUSTER_STRIDE).r) - 1, 0) * BASIS_DIM1;",
+        ),
+    ),
+    Fault(
+        "stale table of levels of detail",
+        PROBE,
+        "probes",
+        "laplacian",
+        (
+            "representations/laplacian.glsl",
+            "int at = (LEVEL_FIRST_TABLE[level] -",
+            "int at = (LEVEL_FIRST_TABLE[max(level - 1, BASE_LEVEL)] -",
+        ),
+    ),
+    Fault("sRGB read as linear", "image.eight_bit.code_p999", "eight_bits", change="linear"),
+    Fault("float16 overflow", "probe.finite.nonfinite", "overflow", "svd", change="overflow"),
+    Fault(
+        "negative values clamped",
+        "image.negative.lost_negative",
+        "picture",
+        "svd",
+        (HOST, SUM, "vec4(scale * max(sum, 0.0), 1.0)"),
+        parameters=(("components", 4),),  # few enough to undershoot
+    ),
+    Fault(
+        "division by zero",
+        "image.finite.nonfinite",
+        "picture",
+        edit=(HOST, SUM, "vec4(scale * sum / step(0.5, fract(uv.x)), 1.0)"),
+    ),
+    Fault(
+        "edges rasterized a third of a pixel off",
+        "image.silhouette.nrmse",
+        "picture",
+        edit=("hosts/mesh.vert", "vec4(position, 1.0);", "vec4(position, 1.0) + vec4(0.014, 0.0, 0.0, 0.0);"),
+    ),
+    Fault("light leaks into the background", "image.background.max_abs", "picture", change="background"),
+    Fault(
+        "the view meets the height field one cell off",
+        "image.mesostructure.nrmse",
+        "picture",
+        "gbrdf",
+        (
+            "lib/heightfield.glsl",
+            "vec2(hit.cell) + march.crossed);",
+            "vec2(hit.cell) + march.crossed + 1.0);",
+        ),
+    ),
+    Fault(
+        "edges a pixel off in eight bits", "image.eight_bit_silhouette.nrmse", "eight_bits", change="shifted"
+    ),
+    Fault(
+        "five percent too bright against a noisy reference",
+        "image.equivalence.relative_rmse",
+        "noisy",
+        change="bright",
+    ),
+    Fault(
+        "environment mirrored",
+        "image.environment_lights.relative_rmse",
+        "environment",
+        edit=(
+            "lib/environment_lights.glsl",
+            "table_fetch(environment_lights, 2 * i).xyz * to_world;",
+            "(vec3(-1.0, 1.0, 1.0) * table_fetch(environment_lights, 2 * i).xyz) * to_world;",
+        ),
+    ),
+    Fault(
+        "a factor of pi in the irradiance",
+        "image.environment.relative_rmse",
+        "environment",
+        "rf_lobes",
+        ("environment/rf_lobes.glsl", "own.a * irradiance;", "3.14159265 * own.a * irradiance;"),
+    ),
+    Fault(
+        "one region a tenth too bright",
+        "image.environment_tiles.relative_tile_bias",
+        "environment",
+        "rf_lobes",
+        change="tile",
+    ),
+    Fault("density of another view", "chi2.rejected.tests", "sampling", change="density"),
+    Fault("weight that is not value over density", "sample.weight.max", "sampling", change="weight"),
+    Fault("density that pdf() does not give", "sample.pdf.max", "sampling", change="pdf"),
+    Fault("batches that share their random numbers", "waterfall.closure.z", "batches", change="shared"),
+)

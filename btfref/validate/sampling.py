@@ -1,0 +1,93 @@
+"""χ² tests of a BSDF's samples against its density, for validation and for tests of the plugin."""
+
+from __future__ import annotations
+
+import tempfile
+from contextlib import chdir
+
+import numpy as np
+
+from btfref.compare.tolerances import tolerance
+
+#: Cells of the test's table are integrated with this many intervals a side.
+INTERVALS = 16
+
+
+def surface(mi, n, uv, w_view):
+    """Surface interactions in their own frame.
+
+    Parameters
+    ----------
+    mi : module
+        Mitsuba with a JIT variant.
+    n : int
+        How many.
+    uv : array_like, shape (2,) or (2, n)
+    w_view : array_like, shape (3,) or (3, n)
+
+    Returns
+    -------
+    mitsuba.SurfaceInteraction3f
+    """
+    import drjit as dr
+
+    def column(values):
+        # A single place is data, not code: one kernel serves all.
+        return dr.opaque(mi.Float, float(values)) if np.ndim(values) == 0 else mi.Float(np.asarray(values))
+
+    si = dr.zeros(mi.SurfaceInteraction3f, n)
+    si.uv = mi.Point2f(*map(column, uv))
+    si.wi = mi.Vector3f(*map(column, w_view))
+    return si
+
+
+def chi_square(mi, bsdf, uv, w_view, *, samples, tests=1, pdf_view=None, counts=None):
+    """Whether the directions that a BSDF samples follow its density.
+
+    Parameters
+    ----------
+    mi : module
+    bsdf : object
+        With ``sample`` and ``pdf`` as of ``mitsuba.BSDF``.
+    uv : array_like, shape (2,)
+    w_view : array_like, shape (3,)
+    samples : int
+    tests : int
+        That are made together: the level is Šidák-corrected by their number.
+    pdf_view : array_like, shape (3,), optional
+        View of the density where it is another, which must be found out.
+    counts : callable, optional
+        ``(si, sample, weight) -> Bool``: samples that are right in other ways too; the others are lost to the test.
+
+    Returns
+    -------
+    bool, str
+        The outcome and what the test says.
+    """
+    import drjit as dr
+
+    context = mi.BSDFContext()
+
+    def sample(s):
+        si = surface(mi, dr.width(s), uv, w_view)
+        bs, weight = bsdf.sample(context, si, s[0], mi.Point2f(s[1], s[2]))
+        right = bs.pdf > 0
+        if counts is not None:
+            right &= counts(si, bs, weight)
+        return bs.wo, dr.select(right, mi.Float(1), 0)
+
+    def pdf(w):
+        return bsdf.pdf(context, surface(mi, dr.width(w), uv, w_view if pdf_view is None else pdf_view), w)
+
+    test = mi.chi2.ChiSquareTest(
+        domain=mi.chi2.SphericalDomain(),
+        sample_func=sample,
+        pdf_func=pdf,
+        sample_dim=3,
+        sample_count=samples,
+        ires=INTERVALS,
+    )
+    # A test that fails writes its tables where it stands.
+    with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
+        right = test.run(tolerance("chi2.significance"), test_count=tests, quiet=True)
+    return bool(right), " ".join(str(test.messages).split())[-200:]
