@@ -53,8 +53,7 @@ def converged(
     -------
     RenderResult
         ``meta["noise"]``, the root mean variance over the mask relative to the mean radiance; ``meta["noise_limit"]``,
-        a quarter of the gate's tolerance; ``meta["spp"]``. With ``grid`` ``meta["batches"]``,
-        four independent pictures, float32 (4, H, W, 3).
+        a quarter of the gate's tolerance; ``meta["spp"]``. With ``grid`` four independent ``pictures``.
     """
     limit = tolerance("reference.standard_error.max_fraction") * tolerance(f"{gate}.relative_rmse")
     seeds = np.random.SeedSequence(seed).generate_state(32)
@@ -69,7 +68,7 @@ def converged(
             # Rounds are weighted by what their noise says: a long round is better than as many short ones.
             noise = float(found.variance[mask].mean()) if mask.any() else 0.0
             weight = 1 / max(noise, 1e-30)
-            pictures = (found.meta["batches"] if grid else found.image[None]).astype(float)
+            pictures = (found.pictures if grid else found.image[None]).astype(float)
             share = weight / (total + weight)
             mean = mean + share * (pictures - mean)
             squared = (1 - share) ** 2 * squared + share**2 * found.variance.astype(float)
@@ -85,6 +84,10 @@ def converged(
             wanted = 1.1 * done * (noise / limit) ** (RATE if grid else 2)
             count = int(np.clip(wanted, BATCHES, max(BATCHES, min(most - done, 16 * done))))
     meta = {**found.meta, "spp": done, "noise": noise, "noise_limit": limit}
-    if grid:
-        meta["batches"] = mean.astype(np.float32)
-    return replace(found, image=image.astype(np.float32), variance=squared.astype(np.float32), meta=meta)
+    return replace(
+        found,
+        image=image.astype(np.float32),
+        variance=squared.astype(np.float32),
+        meta=meta,
+        pictures=mean.astype(np.float32) if grid else None,
+    )

@@ -52,8 +52,7 @@ def render_exact(
     Returns
     -------
     RenderResult
-        With the variance of the mean; ``meta["batches"]`` holds the independent pictures, float32
-        (batches, H, W, 3).
+        With the variance of the mean and the independent ``pictures``.
 
     Raises
     ------
@@ -89,10 +88,11 @@ def render_exact(
         "max_depth": int(depth),
         "mesostructure": {"name": mesostructure.name, "parameters": mesostructure.parameters},
         "seconds": time.perf_counter() - start,
-        "batches": pictures.astype(np.float32),
     }
     variance = pictures.var(0, ddof=1) / batches
-    return RenderResult(pictures.mean(0).astype(np.float32), variance.astype(np.float32), meta)
+    return RenderResult(
+        pictures.mean(0).astype(np.float32), variance.astype(np.float32), meta, pictures.astype(np.float32)
+    )
 
 
 def _pass(scene, material, tiles, grid, rounds, stream, max_depth):

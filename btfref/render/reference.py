@@ -61,8 +61,8 @@ def render(
         Estimate the variance of the mean from independent renders of ``spp / 16`` samples each.
     grid : int, optional
         Direct light only, at n × n regular sub-pixel positions as ``noise_free``, but with random directions of the
-        light, so that environments are possible; always with a variance, and with ``meta["batches"]``, four
-        independent pictures, float32 (4, H, W, 3).
+        light, so that environments are possible; always with a variance and four independent
+        ``pictures``.
     maps : {"all", "needed"}
         "needed" loads the maps of those views, levels of detail and entries of codebooks alone that the cameras' first
         hits need, and without noise those of the lights as well: the same picture bit by bit. ``meta["maps"]`` says how
@@ -137,17 +137,16 @@ def traced(made, *, spp=None, seed=0, noise_free=None, shadows=True, with_varian
 
     spp = spp or _sample_count(made)
     tell_camera(made, 1 / (noise_free or grid or spp**0.5))
-    start = time.perf_counter()
+    start, pictures = time.perf_counter(), None
     if noise_free is not None:
         image, variance = _noise_free(made, noise_free, shadows), None
         settings = {"noise_free": noise_free, "shadows": shadows, "integrator": "noise-free direct"}
     elif grid is not None:
         from btfref.render.direct_light import regular
 
-        batches, variance, spp = regular(made, grid, spp, seed, shadows)
-        image = batches.mean(0)
+        pictures, variance, spp = regular(made, grid, spp, seed, shadows)
+        image = pictures.mean(0)
         settings = {"grid": grid, "spp": spp, "seed": seed, "shadows": shadows, "integrator": "direct"}
-        settings["batches"] = batches
     else:
         image, variance, settings = _monte_carlo(made, spp, seed, with_variance, shadows)
     facts = {
@@ -160,7 +159,7 @@ def traced(made, *, spp=None, seed=0, noise_free=None, shadows=True, with_varian
         "seconds": time.perf_counter() - start,
         **_versions(),
     }
-    return RenderResult(image, variance, facts)
+    return RenderResult(image, variance, facts, pictures)
 
 
 class loaded:  # noqa: N801 - a context manager that reads as a verb

@@ -19,8 +19,11 @@ class RenderResult:
         Of the mean, per pixel and channel; None where nothing is random or it was not asked for.
     meta : dict
         JSON-able facts: renderer, settings, versions, times.
+    pictures : ndarray of float32, shape (n, H, W, 3), or None
+        Independent pictures whose mean is the image, of renderers that keep them.
     """
 
     image: np.ndarray
     variance: np.ndarray | None = None
     meta: dict = field(default_factory=dict)
+    pictures: np.ndarray | None = None

@@ -92,12 +92,12 @@ def _views(cache, mesostructure, scene, lights, settings):
             shadows=False,
             **shared_settings(table, lights, settings),
         )
-        return Views(truth.meta["batches"], pictures.meta["batches"], np.zeros(0, np.float32), classes)
+        return Views(truth.pictures, pictures.pictures, np.zeros(0, np.float32), classes)
     seen = []
     for store in stores:
         table = method("raw").fit(load_material(store))
         seen.append(approximate(path, load_file=lambda _, table=table: table, **shared).image)
-    return Views(truth.meta["batches"], seen[0][None], seen[1], classes)
+    return Views(truth.pictures, seen[0][None], seen[1], classes)
 
 
 def shared_settings(file, lights, settings):
