@@ -24,8 +24,8 @@ BUFFER_RANGE = (8 << 20, 96 << 20)
 PER_TRIANGLE = 400
 
 #: Surface points, bytes per point: geometry; per point and light: table of light and visibility; per point and
-#: view: bins and walks from texels. Measured at 64² texels and 81 lights and views, results of 304 MiB included: checker of
-#: 10 points 1919 MiB, tissue of 18 points 2395 MiB, rings of 25 points 3158 MiB; the sums say 2230, 3310 and 4260.
+#: view: bins and walks from texels. Measured at 64² texels and 81 lights and views, results of 304 MiB included:
+#: checker of 10 points 1919 MiB, tissue of 18 points 2395, rings of 25 points 3158; the sums say 2230, 3310, 4260.
 PER_POINT, PER_POINT_LIGHT, PER_POINT_VIEW = 600, 160, 260
 
 #: Bytes of the surface estimator's buffers, whatever the size of the BTF.
