@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from btfref.bench.timing import interleaved, machine, summary
+from btfref.bench.timing import interleaved, machine, peak_memory, reset_peak, summary
 
 #: Scene with one camera and one light, for which the BTF is traced.
 ONE_LIGHT = ("plane", {"lights": "directional1"})
@@ -31,7 +31,7 @@ SCENES = {
 }
 
 #: Methods whose maps are loaded in part.
-METHODS = ("raw", "lpca", "rf_lobes", "laplacian")
+METHODS = ("raw", "lpca", "laplacian", "rf_lobes", "gbrdf")
 
 BASELINE = "whole"
 
@@ -53,7 +53,8 @@ def run(*, quick=False, progress=None, btf=None, only=None):
     -------
     dict
         ``synthesis``: seconds and bytes of whole, needed part and single pair, shares, whether the pictures are equal;
-        ``scenes``: by scene, shares needed, and by method the shares of bytes, loading time and frame time; ``raw``;
+        ``scenes``: by scene, shares needed, and by method those of bytes of maps, bytes read, loading time, peak memory
+        of it, and frame time; ``raw``;
         ``parameters``; ``machine``.
     """
     tell = progress or (lambda *_: None)
@@ -157,7 +158,7 @@ def synthesis(folder, quick, progress):
 def scenes(folder, btf, quick, progress):
     """What each shipped scene needs, and what its maps then cost to keep, to load and to look up."""
     from btfref.bench.data import checker
-    from btfref.demand import demand, kept_maps, maps_needed
+    from btfref.demand import choice, demand, maps_needed
     from btfref.registry import method
     from btfref.representations import load, save
     from btfref.scenes import scene_file
@@ -180,11 +181,7 @@ def scenes(folder, btf, quick, progress):
                 parameters = fixed | step | {"btf": str(path)}
                 (some,) = demand(file, parameters=parameters, grid=2, size=size).values()
                 one = some if one is None else one | some
-            (kept,) = kept_maps(file, fixed | steps[0] | {"btf": str(path)}, grid=2, size=size).values()
-            kept = {
-                kind: None if chosen is None else np.flatnonzero(getattr(one, kind))
-                for kind, chosen in kept.items()
-            }
+            kept = choice(one)
             entry["shares"] = {what: n / m for what, (n, m) in one.shares().items()}
             times = interleaved(
                 {
@@ -195,12 +192,58 @@ def scenes(folder, btf, quick, progress):
             )
             entry["methods"][key] = {
                 "bytes": _payload(load(path, **kept)) / _payload(whole[key]),
-                "load": summary(times, "all")["needed"]["ratio"],
+                "read": _bytes_read(path, kept) / path.stat().st_size,
+                "load": summary(times, "all")["needed"],
+                "memory": _memory(
+                    lambda path=path, kept=kept: load(path, **kept), lambda path=path: load(path)
+                ),
+                "frame": _frames(file, parameters, kept, size, rounds),
                 "raw": times,
                 "maps": {what: n / m for what, (n, m) in maps_needed(one, whole[key]).maps.items()},
             }
         found[name] = entry
     return found
+
+
+def _frames(file, parameters, kept, size, rounds):
+    """Times of real-time frames with the needed maps alone over those with all, in turn.
+
+    None with an environment, whose light comes from tables that are made of all maps.
+    """
+    from btfref.render.realtime import Renderer
+    from btfref.render.scene import read_scene
+    from btfref.representations import load
+
+    scene = read_scene(file, parameters, size=size)
+    if scene.environment is not None:
+        return None
+    with Renderer(scene) as whole, Renderer(scene, lambda path: load(path, **kept)) as some:
+        times = {"all": [], "needed": []}
+        for number in range(rounds + 1):
+            for name, renderer in (("all", whole), ("needed", some)):
+                seconds = 1e-3 * renderer.draw()
+                if number:
+                    times[name].append(seconds)
+    return summary(times, "all")["needed"]
+
+
+def _memory(needed, whole):
+    """Peak memory of a loading over that of the other one; None where the system does not tell."""
+    peaks = []
+    for task in (needed, whole):
+        before = reset_peak()
+        held = task()
+        after = peak_memory()
+        del held
+        peaks.append(None if before is None or after is None else max(after - before, 0))
+    return peaks[0] / peaks[1] if all(peaks) else None
+
+
+def _bytes_read(path, kept):
+    """Bytes of a file that loading a choice reads: all where rows and parts of their own are not worth it."""
+    from btfref.representations.container import bytes_of_choice
+
+    return bytes_of_choice(path, kept)
 
 
 def _payload(representation):
@@ -212,6 +255,16 @@ def _payload(representation):
 
 def _bytes(path):
     return sum(entry.stat().st_size for entry in path.rglob("*") if entry.is_file())
+
+
+def _spread(entry):
+    """Median ratio with its extremes, in percent."""
+    return " ".join(
+        [
+            f"{100 * entry['ratio']:.0f} %",
+            f"({100 * entry['ratio_min']:.0f} … {100 * entry['ratio_max']:.0f})",
+        ]
+    )
 
 
 def table(result):
@@ -234,6 +287,9 @@ def table(result):
         rows += [(scene, what, f"{100 * share:.1f} %") for what, share in entry["shares"].items()]
         for key, costs in entry["methods"].items():
             further = "".join(f", {what} {100 * share:.0f} %" for what, share in costs["maps"].items())
-            text = f"bytes {100 * costs['bytes']:.1f} %, load {100 * costs['load']:.0f} %{further}"
+            memory, frame = costs["memory"], costs["frame"]
+            text = f"maps {100 * costs['bytes']:.1f} %, read {100 * costs['read']:.0f} %, load {_spread(costs['load'])}"
+            text += "" if memory is None else f", peak {100 * memory:.0f} %"
+            text += f", frame {_spread(frame) if frame else '–'}{further}"
             rows.append((scene, key, text))
     return ("what", "needed", "share"), rows

@@ -7,6 +7,7 @@ turns, so that item i of each makes a pair.
 
 from __future__ import annotations
 
+import gc
 import tempfile
 import time
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 
 from btfref.bench import scenes
 from btfref.bench.evaluators import EVALUATORS, evaluation, random_points
-from btfref.bench.timing import interleaved, kernels
+from btfref.bench.timing import interleaved, kernels, peak_memory, reset_peak
 
 
 def timed_builds(makes, rounds, report=lambda name: None):
@@ -41,11 +42,11 @@ def timed_builds(makes, rounds, report=lambda name: None):
         for name, make in makes.items():
             report(name)
             built.pop(name, None)
-            before = _reset_peak()
+            before = reset_peak()
             start = time.perf_counter()
             built[name] = make(built)
             seconds = time.perf_counter() - start
-            peak = _peak()
+            peak = peak_memory()
             if i:
                 records[name]["warm_s"].append(seconds)
                 continue
@@ -123,7 +124,10 @@ def measure_eval(built, path, plan, entry, rng):
 
 
 def measure_render(subjects, btf, plan):
-    """Pictures of equal samples: every build and every plain material, in turn.
+    """Pictures of equal samples: every build in turn with the baseline, and the first with the other plain materials.
+
+    A kernel calls the materials that are alive, whether its scene shows them or not: with all methods alive, each
+    compiled for as long as all of them together. So there are no more than one of them and the plain ones at a time.
 
     Parameters
     ----------
@@ -135,40 +139,57 @@ def measure_render(subjects, btf, plan):
     ------
     entry or None, dict
         None for a plain material; ``variance`` is the mean over the pixels of the squared noise of one picture, by
-        half the squared difference of two, ``mean`` that of the radiance.
+        half the squared difference of two, ``mean`` that of the radiance; ``baseline_s`` of an entry are the
+        baseline's times in its rounds.
     """
+    plain = {name: (None, {}, bsdf) for name, bsdf in scenes.plain_materials(btf).items()}
+    groups = [(entry, path, query) for entry, path in subjects for query in entry.query]
+    for scene in plan.settings["scenes"]:
+        for number, (entry, path, query) in enumerate(groups):
+            name = " ".join([entry.name, *map(str, query.values())])
+            chosen = plain if number == 0 else {scenes.BASELINE: plain[scenes.BASELINE]}
+            materials = {**chosen, name: (entry, query, scenes.btf_material(path, query))}
+            records = _rendered(materials, scene, plan)
+            for key, (own, _, _) in materials.items():
+                if own is not None:
+                    records[key]["baseline_s"] = records[scenes.BASELINE]["warm_s"]
+                if own is not None or number == 0:
+                    yield own, records[key]
+
+
+def _rendered(materials, scene, plan):
+    """Records of materials in one scene, in turn."""
     import mitsuba as mi
 
-    materials = {name: (None, {}, bsdf) for name, bsdf in scenes.plain_materials(btf).items()}
-    for entry, path in subjects:
-        for query in entry.query:
-            name = " ".join([entry.name, *map(str, query.values())])
-            materials[name] = (entry, query, scenes.btf_material(path, query))
-    for scene in plan.settings["scenes"]:
-        tasks, pictures, cold = {}, {}, {}
-        for name, (_, _, bsdf) in materials.items():
-            loaded = mi.load_dict(scenes.scene(scene, bsdf, size=plan.settings["render_size"]))
-            render = scenes.render_task(loaded, plan.settings["render_spp"])
-            pictures[name] = []
-            tasks[name] = _keeping(render, pictures[name])
-            cold[name] = _cold(tasks[name], True)
-        times = interleaved(tasks, plan.rounds["render"])
-        for name, (entry, query, _) in materials.items():
-            one, other = pictures[name]
-            yield (
-                entry,
-                {
-                    "name": name,
-                    "query": query,
-                    "scene": scene,
-                    "spp": plan.settings["render_spp"],
-                    "cold_s": cold[name][0],
-                    "warm_s": times[name],
-                    **cold[name][1],
-                    "variance": float(((one - other) ** 2).mean() / 2),
-                    "mean": float(one.mean()),
-                },
-            )
+    tasks, pictures, cold = {}, {}, {}
+    for name, (_, _, bsdf) in materials.items():
+        loaded = mi.load_dict(scenes.scene(scene, bsdf, size=plan.settings["render_size"]))
+        render = scenes.render_task(loaded, plan.settings["render_spp"])
+        pictures[name] = []
+        tasks[name] = _keeping(render, pictures[name])
+    # After all are loaded: another material changes every kernel.
+    for name, task in tasks.items():
+        cold[name] = _cold(task, True)
+    times = interleaved(tasks, plan.rounds["render"])
+    result = {}
+    for name, (_, query, _) in materials.items():
+        one, other = pictures[name]
+        result[name] = {
+            "name": name,
+            "query": query,
+            "scene": scene,
+            "spp": plan.settings["render_spp"],
+            "cold_s": cold[name][0],
+            "warm_s": times[name],
+            **cold[name][1],
+            "variance": float(((one - other) ** 2).mean() / 2),
+            "mean": float(one.mean()),
+        }
+    # Materials are in cycles with their scenes: the next kernels would call them too.
+    tasks.clear()
+    del loaded, render
+    gc.collect()
+    return result
 
 
 def measure_sampling(entry, path, plan):
@@ -261,24 +282,3 @@ def _keeping(render, pictures):
             pictures.append(np.array(image))
 
     return task
-
-
-def _reset_peak():
-    """Start counting the peak of the process anew; what it holds now in bytes, or None."""
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-        return _status("VmRSS")
-    except OSError:
-        return None
-
-
-def _peak():
-    return _status("VmHWM")
-
-
-def _status(field):
-    try:
-        lines = Path("/proc/self/status").read_text().splitlines()
-    except OSError:
-        return None
-    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(field + ":")), None)

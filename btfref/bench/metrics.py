@@ -186,7 +186,9 @@ def rows(folder, records=None):
             row["per_second"] = r["points"] / row["time"]["median"]
             row |= {"largest_difference": r["largest_difference"], "kernels": r.get("kernels")}
         elif kind == "render":
+            # A build's rounds have a baseline of their own.
             base = plain[r["run"], r["material"], r["scene"]]
+            base = {"warm_s": r["baseline_s"]} if "baseline_s" in r else base
             row |= {"scene": r["scene"], "cold_s": r["cold_s"], "time": time_of(r), "kernels": r["kernels"]}
             row["ratio"] = paired_ratio(r, base)
             # The noise of a picture that is given one second: variance falls with samples, samples grow with time.

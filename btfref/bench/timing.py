@@ -6,6 +6,7 @@ import os
 import platform
 import statistics
 import time
+from pathlib import Path
 
 from btfref.versions import versions
 
@@ -97,3 +98,25 @@ def kernels(task):
         "backend_s": 1e-3 * sum(e["backend_time"] for e in new),
         "execution_s": 1e-3 * sum(e["execution_time"] for e in entries),
     }
+
+
+def reset_peak():
+    """Start counting the peak of the process anew; what it holds now in bytes, or None."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+        return _status("VmRSS")
+    except OSError:
+        return None
+
+
+def peak_memory():
+    """Most that the process held since :func:`reset_peak`, bytes, or None."""
+    return _status("VmHWM")
+
+
+def _status(field):
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return None
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(field + ":")), None)

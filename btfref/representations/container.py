@@ -182,7 +182,28 @@ def read_maps(path, wanted):
     return arrays, manifest["meta"]
 
 
-def _read_some(path, manifest, choice):
+def bytes_of_choice(path, choice):
+    """How many bytes of a file :func:`load` reads for a choice of views, lights, entries and levels.
+
+    Parameters
+    ----------
+    path : path-like
+    choice : dict
+        Arguments of :func:`load`.
+
+    Returns
+    -------
+    int
+    """
+    manifest, _ = _open(path, header_only=True)
+    found = []
+    _read_some(
+        path, manifest, {"views": None, "lights": None, "entries": None, "levels": None} | choice, found
+    )
+    return found[0] if found else Path(path).stat().st_size
+
+
+def _read_some(path, manifest, choice, bytes_read=None):
     """The maps with the rows that a choice needs, or None where reading the whole file takes no longer."""
     kind = method(manifest["meta"]["method"], file=path).representation
     plans, needed, whole = {}, 0, 0
@@ -206,6 +227,8 @@ def _read_some(path, manifest, choice):
             entry = manifest["arrays"][name]
             pixels = reader.read(name, channel_names(entry["shape"][-1]), rows)
             arrays[name] = _read_map(path, name, entry, pixels, manifest)
+        if bytes_read is not None:
+            bytes_read.append(reader.bytes_read)
     return arrays
 
 
