@@ -93,7 +93,7 @@ def test_every_shipped_plan_can_be_read():
             plan = read_plan(path, quick=quick)
             assert plan.name == name
             assert plan.entries
-    everything = read_plan(shipped()["render"])
+    everything = read_plan(shipped()["realtime"])
     assert {e.method for e in everything.entries} == set(methods())
     assert all(len(e.query) == 2 for e in everything.entries)
 
