@@ -14,6 +14,7 @@ identity.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import combinations
 
 import numpy as np
 
@@ -244,22 +245,19 @@ def waterfall(pictures, mask, display, *, parts=()):
     values = [np.asarray(p.batches[:, mask], np.float64) for p in pictures]
     if not all(np.isfinite(v).all() for v in values):
         raise InputError("a picture of the chain is not finite", field="pictures")
-    pairs = [_pairs(v) for v in values]
-    # Half sums and differences of the two batches of a pair, by pair and picture.
-    half = np.array([[0.5 * (a + b) for a, b in pair] for pair in pairs])
-    spread = np.array([[a - b for a, b in pair] for pair in pairs])
-    step, noise = np.diff(half, axis=0), np.diff(spread, axis=0)
-    first, second = ((step[:, pair], noise[:, pair]) for pair in (0, 1))
-    n = len(step)
+    quarters = np.array([_quarters(v) for v in values])
+    steps = np.diff(quarters, axis=0)
+    first, second = (_Pair(steps, *chosen) for chosen in ((0, 1), (2, 3)))
+    n = len(steps)
     every, own = np.ones((n, n)), np.eye(n)
     stages = []
     for k in range(n):
         so_far = np.arange(n) <= k
-        mse = _form(*first, np.diag(own[k]))
+        mse = _form(first, np.diag(own[k]))
         colours = [_delta_e00(values[k + 1], values[other], display) for other in (k, 0)]
-        found = rmse_interval(_form(*first, np.outer(so_far, so_far)))
+        found = rmse_interval(_form(first, np.outer(so_far, so_far)))
         stages.append(Stage(pictures[k + 1].name, mse, rmse_interval(mse), found, *colours))
-    total, whole = _form(*second, every), _form(*first, every)
+    total, whole = _form(second, every), _form(first, every)
     closure = _difference(total, whole)
     # Without noise, float64 sums of some thousand products.
     floor = 1e-12 * max(total.estimate, sum(stage.mse.estimate for stage in stages))
@@ -267,10 +265,10 @@ def waterfall(pictures, mask, display, *, parts=()):
     return Waterfall(
         tuple(stages),
         total,
-        _difference(total, _form(*first, own)),
-        _form(*first, every - own),
+        _difference(total, _form(first, own)),
+        _form(first, every - own),
         closure,
-        _products(stages, *first),
+        _products(stages, first),
         tuple(parts),
         float(values[0].mean()),
         int(np.count_nonzero(mask)),
@@ -278,15 +276,33 @@ def waterfall(pictures, mask, display, *, parts=()):
     )
 
 
-def _pairs(batches):
-    """Two pairs of independent halves; a picture without noise is its own."""
-    if len(batches) == 1:
-        return [(batches[0], batches[0])] * 2
-    quarters = [batches[i::4].mean(0) for i in range(4)]
-    return [(quarters[0], quarters[1]), (quarters[2], quarters[3])]
+def _quarters(batches):
+    """Four independent pictures; one without noise is its own."""
+    return np.stack([batches[i::4].mean(0) if len(batches) > 1 else batches[0] for i in range(4)])
 
 
-def _form(step, noise, weights):
+class _Pair:
+    """Two of four batches whose product is taken; all six pairs say how much it varies.
+
+    Half sums and differences of a pair estimate the variance of its own product; where a few pixels hold most of the
+    noise that estimate has few degrees of freedom, and two batches that agree by chance would pass for certain.
+    """
+
+    def __init__(self, steps, i, j):
+        self.half, self.difference = self._halves(steps, i, j)
+        self._steps = steps
+
+    @staticmethod
+    def _halves(steps, i, j):
+        return 0.5 * (steps[:, i] + steps[:, j]), steps[:, i] - steps[:, j]
+
+    def spreads(self):
+        """Half sums and differences of every pair."""
+        for i, j in combinations(range(4), 2):
+            yield self._halves(self._steps, i, j)
+
+
+def _form(pair, weights):
     """Mean of a quadratic form Σ w_jk e_j e_k of the stages and its interval.
 
     With S the half sums and D the differences of two batches, S·wS − D·wD / 4 is x·wy of the batches x and y: free of
@@ -295,7 +311,8 @@ def _form(step, noise, weights):
 
     Parameters
     ----------
-    step, noise : array, shape (stages, pixels, 3)
+    pair : _Pair
+        Of stages, each shape (stages, pixels, 3).
     weights : array, shape (stages, stages)
         Symmetric.
 
@@ -303,13 +320,15 @@ def _form(step, noise, weights):
     -------
     Interval
     """
-    weighted = np.tensordot(weights, noise, 1)
-    product = np.sum(step * np.tensordot(weights, step, 1) - noise * weighted / 4, (0, 2))
-    spread = np.sum(step * weighted, (0, 2))
-    channels = step.shape[-1]
-    return interval(
-        product.mean() / channels, np.linalg.norm(spread) / spread.size / channels, confidence=CONFIDENCE
-    )
+    weights = np.asarray(weights, float)
+
+    def product(a, b):
+        return np.sum(a * np.tensordot(weights, b, 1), (0, 2))
+
+    mean = product(pair.half, pair.half) - product(pair.difference, pair.difference) / 4
+    square = np.mean([np.sum(product(s, d) ** 2) for s, d in pair.spreads()])
+    count = pair.half[0].size
+    return interval(mean.sum() / count, np.sqrt(square) / count, confidence=CONFIDENCE)
 
 
 def _difference(a, b):
@@ -318,14 +337,14 @@ def _difference(a, b):
     return interval(a.estimate - b.estimate, error, confidence=CONFIDENCE)
 
 
-def _products(stages, step, noise):
+def _products(stages, pair):
     """Pairs of stages by the size of their mean product."""
     found, n = [], len(stages)
     for j in range(n):
         for k in range(j + 1, n):
             weights = np.zeros((n, n))
             weights[[j, k], [k, j]] = 1
-            mse = _form(step, noise, weights)
+            mse = _form(pair, weights)
             a, b = (stages[i].mse for i in (j, k))
             # A stage that may be nothing but noise has no direction.
             known = a.low > 0 and b.low > 0

@@ -87,6 +87,16 @@ def test_intervals_hold_what_they_promise(rng, channels):
     assert missed <= 6
 
 
+def test_batches_that_agree_by_chance_are_no_certainty(rng):
+    """One pixel with nearly all of the noise, alike in two batches: the other two say how much it varies."""
+    truth = 0.5 + 1e-4 * rng.normal(size=(4, 12, 12, 3))
+    truth[:2, 5, 5] += 0.4
+    found = waterfall(
+        [Picture("truth", truth), Picture("stage", np.full((1, 12, 12, 3), 0.51))], MASK[:12, :12], Display()
+    )
+    assert found.explained
+
+
 def test_covariances_hold_what_they_promise(rng):
     """Their 99 % interval too, for stages that share a noisy picture."""
     missed = 0
