@@ -9,7 +9,7 @@ from btfref.conventions import LUMINANCE
 from btfref.numerics.frames import ROTATION_FLOOR
 from mitsuba_plugins.heightfield import HeightField
 from mitsuba_plugins.microfacets import HalfVectors, Microfacets
-from mitsuba_plugins.parabolic import ParabolicMaps, bilinear_stencil
+from mitsuba_plugins.parabolic import ParabolicMaps, bilinear_stencil, half_sum
 from mitsuba_plugins.tables import wide
 
 
@@ -46,7 +46,7 @@ class Evaluator:
         cos_light = dr.dot(w_light, normal)
         active = active & (cos_light > 0)
         active &= self.field.lit(cell, local, height, w_light, active)
-        h = w_light + w_view
+        h = half_sum(w_light, w_view)
         length = dr.sqrt(dr.squared_norm(h))
         # Tables are looked up with any length: a normalisation less is a rounding less near the horizon.
         facet = mi.Vector3f(dr.dot(h, tangent), dr.dot(h, bitangent), dr.dot(h, normal))

@@ -6,13 +6,20 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from btfref.numerics.halfway import LENGTHEN, SHORT
 from btfref.representations.factored import raised
 from mitsuba_plugins.tables import HALF_LIMIT, HALF_SCALE, HALF_SHIFT, read_packets, wide, widened
 
 
-def half_difference(w_light, w_view):
-    """As :func:`btfref.numerics.halfway.half_difference`; h is not normalised where it is only looked up."""
+def half_sum(w_light, w_view):
+    """A vector along the half vector, whose square does not underflow."""
     h = w_light + w_view
+    return h * dr.select(dr.max(dr.abs(h)) < SHORT, LENGTHEN, 1)
+
+
+def half_difference(w_light, w_view):
+    """As :func:`btfref.numerics.halfway.half_difference`."""
+    h = half_sum(w_light, w_view)
     length = dr.norm(h)
     h = dr.select(length > 0, h / length, mi.Vector3f(0, 0, 1))
     a = 1 / (1 + h.z)

@@ -28,6 +28,26 @@ def half_frame(h):
     return tangent, bitangent
 
 
+#: Sums of directions shorter than this are mirrored to the last bit, and their squares underflow in float32: they are
+#: scaled first. All evaluators do the same.
+SHORT, LENGTHEN = 1e-15, 1e20
+
+
+def half_vector(w_light, w_view):
+    """Unit half vector, shape (..., 3); the normal where opposite directions on the horizon have none.
+
+    Parameters
+    ----------
+    w_light, w_view : array_like, shape (..., 3)
+        Unit vectors of the upper hemisphere.
+    """
+    h = real(w_light) + real(w_view)
+    h = np.where(np.abs(h).max(-1, keepdims=True) < SHORT, h * real(LENGTHEN), h)
+    length = np.linalg.norm(h, axis=-1, keepdims=True)
+    # Any will do there, where B is zero.
+    return np.where(length > 0, h / np.where(length > 0, length, 1), real([0.0, 0.0, 1.0]))
+
+
 def half_difference(w_light, w_view):
     """Half and difference vectors.
 
@@ -42,10 +62,7 @@ def half_difference(w_light, w_view):
         Unit vectors with z ≥ 0: h in the surface's frame, d (the light) in that of h.
     """
     w_light, w_view = np.broadcast_arrays(real(w_light), real(w_view))
-    h = w_light + w_view
-    length = np.linalg.norm(h, axis=-1, keepdims=True)
-    # Opposite directions on the horizon have no half vector; any will do there, where B is zero.
-    h = np.where(length > 0, h / np.where(length > 0, length, 1), real([0.0, 0.0, 1.0]))
+    h = half_vector(w_light, w_view)
     tangent, bitangent = half_frame(h)
     d = np.stack([(w_light * axis).sum(-1) for axis in (tangent, bitangent, h)], -1)
     return h, d

@@ -19,6 +19,7 @@ import numpy as np
 
 from btfref import conventions
 from btfref.numerics.frames import surface_frame
+from btfref.numerics.halfway import half_vector
 from btfref.numerics.heightfield import LIFT, HeightField
 from btfref.numerics.microfacets import geometry_factor, schlick, specular_albedo_bound
 from btfref.numerics.parabolic import bilinear_stencil
@@ -185,9 +186,7 @@ class Representation(StoredMaps):
         if self.meta.get("partial", False):
             colour = refuse_absent(colour, weight, "entries")
         diffuse = np.einsum("nt,ntc->nc", weight, colour[..., :3]) * (cos_light / np.pi)[:, None]
-        h = w_light[lit] + w_view[lit]
-        length = np.linalg.norm(h, axis=-1, keepdims=True)
-        h = h / np.where(length > 0, length, 1)
+        h = half_vector(w_light[lit], w_view[lit])
         local = np.stack([(h * axis[lit]).sum(-1) for axis in (tangent, bitangent, normal)], -1)
         factor = geometry_factor(cos_light, (w_view[lit] * normal[lit]).sum(-1))
         # Microfacets behind the surface reflect nothing.

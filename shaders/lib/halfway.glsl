@@ -3,6 +3,8 @@
 
 vec3 half_vector(vec3 w_light, vec3 w_view) {
     vec3 h = w_light + w_view;
+    // Mirrored to the last bit: the squares would underflow.
+    h *= max(max(abs(h.x), abs(h.y)), abs(h.z)) < 1e-15 ? 1e20 : 1.0;
     float square = dot(h, h);
     // Opposite directions on the horizon have no half vector; any will do there.
     return square > 0.0 ? h / sqrt(square) : vec3(0.0, 0.0, 1.0);

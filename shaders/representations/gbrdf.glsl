@@ -4,6 +4,7 @@
 // Menzel and Guthe 2009, eq. 1 and 2, times the light's cosine:
 // B = c_d/pi (k1.n) + c_s p(h) F(k1.h) k1.n / (k1.n + k2.n - (k1.n)(k2.n)), F(u) = r0 + (1 - r0)(1 - u)^5.
 #include "lib/directions.glsl"
+#include "lib/halfway.glsl"
 #include "lib/heightfield.glsl"
 #include "lib/parabolic_maps.glsl"
 
@@ -56,7 +57,7 @@ vec3 btf_eval(vec2 uv, vec3 w_light, vec3 w_view, float lod) {
         return vec3(0.0);
     }
     float view = max((frame * w_view).z, 0.0);
-    vec3 h = normalize(w_light + w_view);
+    vec3 h = half_vector(w_light, w_view);
     vec3 facet = frame * h;
     // The denominator is at least k1.n > 0; microfacets behind the surface reflect nothing.
     float factor = facet.z > 0.0 ? light / (light + view * (1.0 - light)) : 0.0;
