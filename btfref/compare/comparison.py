@@ -303,9 +303,10 @@ def _class_metrics(t, r, maps, ssim, peak):
 
 def _class_statistics(t, r, variance, mask, p_values):
     d, v = (t - r)[mask], variance[mask]
-    mse = significance.mse_interval(d, v, confidence=CONFIDENCE)
+    shared = {"confidence": CONFIDENCE, "correlated": d.shape[-1]}
+    mse = significance.mse_interval(d, v, **shared)
     return {
-        "bias": significance.bias_interval(d, v, confidence=CONFIDENCE).to_dict(),
+        "bias": significance.bias_interval(d, v, **shared).to_dict(),
         "rmse_without_noise": significance.rmse_interval(mse).to_dict(),
         "noise": float(np.sqrt(v.mean())),
         "difference": significance.difference_test(
@@ -377,7 +378,9 @@ def _equivalence(t, r, variance, table):
     scale = float(np.mean(np.abs(r)))
     if scale == 0:
         return Measured(None, "fail", "the reference is black: no relative error")
-    mse = significance.mse_interval(t - r, variance, confidence=1 - table["significance"])
+    mse = significance.mse_interval(
+        t - r, variance, confidence=1 - table["significance"], correlated=t.shape[-1]
+    )
     found = significance.rmse_interval(mse)
     relative = significance.interval(found.estimate / scale, found.standard_error / scale)
     relative = significance.Interval(

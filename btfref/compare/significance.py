@@ -164,7 +164,7 @@ def interval(estimate, standard_error, *, confidence=0.99, freedom=None):
     )
 
 
-def bias_interval(difference, variance, *, confidence=0.99):
+def bias_interval(difference, variance, *, confidence=0.99, correlated=1):
     """Mean of a difference and its interval.
 
     Parameters
@@ -174,16 +174,19 @@ def bias_interval(difference, variance, *, confidence=0.99):
     variance : array or float
         Variance of each entry of it, the sum of both pictures' variances.
     confidence : float, optional
+    correlated : int, optional
+        Entries that may share their random numbers, such as a pixel's three channels: the variance of their sum is at
+        most this many times that of independent ones (Cauchy-Schwarz), and that is what counts.
 
     Returns
     -------
     Interval
     """
     d, v = _with_variance(difference, variance)
-    return interval(d.mean(), np.sqrt(v.sum()) / d.size, confidence=confidence)
+    return interval(d.mean(), np.sqrt(correlated * v.sum()) / d.size, confidence=confidence)
 
 
-def mse_interval(difference, variance, *, confidence=0.99):
+def mse_interval(difference, variance, *, confidence=0.99, correlated=1):
     """Mean squared error with the noise taken out, and its interval: mean of d² - v.
 
     For d normal with mean b and known variance v, d² - v is an unbiased estimate of b² and 4 d² v - 2 v²
@@ -194,6 +197,8 @@ def mse_interval(difference, variance, *, confidence=0.99):
     difference, variance : array
         As in `bias_interval`.
     confidence : float, optional
+    correlated : int, optional
+        As in `bias_interval`.
 
     Returns
     -------
@@ -202,7 +207,7 @@ def mse_interval(difference, variance, *, confidence=0.99):
     """
     d, v = _with_variance(difference, variance)
     spread = max(float(np.sum(4 * d**2 * v - 2 * v**2)), float(np.sum(2 * v**2)))
-    return interval(np.mean(d**2 - v), np.sqrt(spread) / d.size, confidence=confidence)
+    return interval(np.mean(d**2 - v), np.sqrt(correlated * spread) / d.size, confidence=confidence)
 
 
 def mse_interval_from_halves(difference_1, difference_2, *, confidence=0.99):

@@ -368,6 +368,28 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rng, bias):
     ).all()
 
 
+def test_intervals_hold_for_channels_that_share_their_noise(rng):
+    """Grey noise: the bound is exact there, and intervals that took channels for independent would be too narrow."""
+    level, slack = (
+        tolerance("significance.calibration.significance_parameter"),
+        tolerance("significance.calibration.max_deviation"),
+    )
+    truth = np.repeat(np.linspace(-0.1, 0.2, 200)[:, None], 3, 1)
+    settings, hits = {"confidence": 1 - level}, np.zeros((2, 2))
+    for _ in range(2000):
+        seen = truth + 0.07 * rng.standard_normal((200, 1))
+        for i, correlated in enumerate((3, 1)):
+            mean = significance.bias_interval(seen, 0.07**2, correlated=correlated, **settings)
+            square = significance.mse_interval(seen, 0.07**2, correlated=correlated, **settings)
+            hits[i] += [
+                mean.low <= truth.mean() <= mean.high,
+                square.low <= np.mean(truth**2) <= square.high,
+            ]
+    share = hits / 2000
+    assert (np.abs(share[0] - (1 - level)) <= slack).all()
+    assert (share[1] < 1 - level - slack).all()
+
+
 def test_rmse_interval_is_never_negative():
     found = significance.rmse_interval(significance.interval(-0.01, 0.02))
     assert found.low == found.estimate == 0
