@@ -20,7 +20,7 @@ CHOSEN = [*RNG.choice(57, 4, replace=False).tolist(), *(57 + RNG.choice(24, 2, r
 
 #: Runs of different seeds, whose spread is the synthesis' own noise, and samples of each. Points and walks are shared
 #: by all pairs: as many of them as paths leave the mean of all pairs several times noisier.
-RUNS, SPP = {"path": 6, "surface": 12}, {"path": 256, "surface": 1024}
+RUNS, SPP = {"path": 6, "surface": 24}, {"path": 256, "surface": 1024}
 
 #: Runs and samples where a difference of some percent is all that is looked for.
 FEW_RUNS, FEW_SPP = 6, {"path": 256, "surface": 64}
@@ -71,9 +71,8 @@ def _compare(llvm, name, estimator, n_pairs, rounds):
 def test_thirty_pairs_equal_plain_renders(llvm, name, estimator):
     rejected, bias, error = _compare(llvm, name, estimator, 30, ROUNDS)
     assert rejected <= tolerance("closing_loop.difference.rejected_fraction")
-    # The interval of 95 % must touch the limit's inside, and not be wider than the limit itself.
-    assert abs(bias) - 1.96 * error <= tolerance("synthesis.surface.bias")
-    assert 1.96 * error <= tolerance("synthesis.surface.bias")
+    # The whole interval of 95 % lies inside the limit: what is undecided does not pass.
+    assert abs(bias) + 1.96 * error <= tolerance("synthesis.surface.bias")
 
 
 @pytest.mark.parametrize("estimator", ["path", "surface"])
