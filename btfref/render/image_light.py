@@ -58,7 +58,7 @@ class _PrefilteredLobes:
         edge = representation.meta["constants"]["light_edge"]
         return {
             "environment_maps": prefilter.lobe_maps(environment, size=size, slices=slices),
-            "clipped_lobes": prefilter.clipped_lobes(edge, cosine=cls.cosine, slices=slices),
+            "clipped_lobes": prefilter.clipped_lobes(edge, cosine=cls.cosine),
         }
 
 

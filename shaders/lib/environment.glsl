@@ -1,5 +1,5 @@
 // Provides environment_lobe, environment_irradiance: a prefiltered environment, as btfref/render/prefilter.py makes it.
-// Expects environment_maps [2 slices, size, size, 3] and clipped_lobes [slices, heights, 4].
+// Expects environment_maps [2 slices, size, size, 3] and clipped_lobes [rows, heights, 4].
 
 #include "lib/powers.glsl"
 #include "lib/sphere_maps.glsl"
@@ -20,13 +20,13 @@ vec4 clipped_lobe(int slice, float height) {
 }
 
 // Integral of max(axis . l, 0)^exponent L(l) over the hemisphere (Meseth, Mueller, Klein 2004, section 5.2), the axis in
-// the frame that to_world takes to world space. Linear in the logarithm of the exponent between the slices, which are
+// the frame that to_world takes to world space. Linear in the logarithm of the exponent between slices and rows, which are
 // at 2^(i/2).
 vec3 environment_lobe(vec3 axis, mat3 to_world, float exponent) {
     const int slices = ENVIRONMENT_MAPS_DIM0 / 2;
     float n = max(exponent, 1.0);
-    float position = clamp(2.0 * log2_accurate(n), 0.0, float(slices - 1));
-    int low = min(int(position), slices - 2);
+    float position = clamp(2.0 * log2_accurate(n), 0.0, float(CLIPPED_LOBES_DIM0 - 1));
+    int low = min(int(position), CLIPPED_LOBES_DIM0 - 2);
     vec4 lobe = mix(clipped_lobe(low, axis.z), clipped_lobe(low + 1, axis.z), position - float(low));
     vec3 moved = to_world * vec3(axis.xy * lobe.y, lobe.z);
     position = clamp(lobe.w, 0.0, float(slices - 1));

@@ -108,7 +108,7 @@ def test_moments_of_a_constant_environment(rng):
 
 
 def test_shares_above_the_horizon():
-    n = prefilter.exponents()
+    n = prefilter.exponents(prefilter.CLIPPED)
     for cosine, upright in ((False, np.ones_like(n)), (True, (n + 1) / (n + 2))):
         shares = prefilter.clipped_lobes(0.0, cosine=cosine)[..., 0]
         assert np.abs(shares[:, -1] - upright).max() <= tolerance("environment.shares.max")
