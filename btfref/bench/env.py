@@ -23,7 +23,7 @@ ENVIRONMENTS = ("harmonics", "studio", "sky", "bright-texel")
 
 ORDERS = range(2, 11)
 
-CLUSTERS, COMPONENTS = (4, 8, 16, 32, 64), (1, 2, 4, 8, 16)
+CLUSTERS, COMPONENTS, MAP_SIZES = (4, 8, 16, 32, 64), (1, 2, 4, 8, 16), (8, 32)
 
 #: Rounds of the timings; the first one, which allocates, is apart.
 ROUNDS = 9
@@ -149,13 +149,13 @@ def _transfer(fitted, quick):
     inside, rows, raw = _inside(file, settings), [], []
     exact = realtime(file, environment="sh", **settings).image[inside]
     settings_of = [{"clusters": k} for k in CLUSTERS] + [{"components": c} for c in COMPONENTS]
-    settings_of += [{"bits": 8}, {"bits": 8, "components": 4}]
+    settings_of += [{"map_size": n} for n in MAP_SIZES] + [{"bits": 8}, {"bits": 8, "components": 4}]
     for given in settings_of[:: 2 if quick else 1]:
         start = time.perf_counter()
         image = realtime(file, environment="transfer", transfer=TransferSettings(**given), **settings)
         raw.append(time.perf_counter() - start)
         error = float(np.sqrt(np.mean((image.image[inside] - exact) ** 2)) / exact.mean())
-        facts = ("matrix_clusters", "matrix_components", "bits", "matrix_error", "table_bytes")
+        facts = ("matrix_clusters", "matrix_components", "map_size", "bits", "matrix_error", "table_bytes")
         rows.append({**{k: image.meta[k] for k in facts}, "rmse": error})
     return rows, raw
 
@@ -207,7 +207,8 @@ def table(result):
         ringing = f", ringing {100 * entry['ringing']:.0f} %" if "ringing" in entry else ""
         rows.append((f"lpca, {entry['way']}{window}", entry["environment"], _percent(entry) + ringing))
     for entry in result["summary"].get("transfer", ()):
-        setting = f"{entry['matrix_clusters']} × {entry['matrix_components']}, {entry['bits']} bits"
+        setting = f"{entry['matrix_clusters']} × {entry['matrix_components']}, maps of {entry['map_size']}²"
+        setting += f", {entry['bits']} bits"
         rows.append((f"transfer {setting}", f"{entry['table_bytes']} bytes", f"{100 * entry['rmse']:.3f} %"))
     for entry in result["summary"].get("time", ()):
         rows.append((entry["what"], "", f"{entry['median_ms']:.1f} ms"))

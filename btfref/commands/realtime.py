@@ -59,7 +59,7 @@ def add_arguments(parser):
         nargs="+",
         action="extend",
         metavar="KEY=VALUE",
-        help="clusters, components, shadows (0 or 1), bounces and bits (8 or 32) of the transfer",
+        help="clusters, components, shadows (0 or 1), bounces, bits (8 or 32) and map_size of the transfer",
     )
     parser.add_argument("--png", action="store_true", help="also write X.png, for eyes")
     parser.add_argument("--json", action="store_true", help="print frame time and OpenGL renderer as JSON")

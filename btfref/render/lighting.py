@@ -254,7 +254,7 @@ class Lighting:
 
     def _by_transfer(self, representation, file, number):
         mesh, settings, order = self._meshes[number], self._transfer, self._order
-        material = transfer_light.Material(representation, order, file=file)
+        material = transfer_light.Material(representation, order, map_size=settings.map_size, file=file)
         vertices = self._vertex_transfer
         matrices = corner_matrices(mesh, order, None if vertices is None else vertices[number])
         transfer = clustered(matrices, settings)
@@ -289,6 +289,7 @@ class Lighting:
             "matrix_components": transfer.basis.shape[1] - 1,
             "matrix_error": transfer.error,
             "material_clusters": len(material.present),
+            "map_size": material.map_size,
             "bits": settings.bits,
             "table_bytes": light.table_bytes,
             "lambda_ms": light.milliseconds,
@@ -298,7 +299,7 @@ class Lighting:
         constants = {
             "HAS_BINS": True,
             "TRANSFER_BITS": settings.bits,
-            "TRANSFER_SIZE": transfer_light.SIZE,
+            "TRANSFER_SIZE": material.map_size,
             "TRANSFER_SIDES": 2 if two_sided else 1,
             "TRANSFER_CLUSTERS": len(transfer.basis),
             "TRANSFER_MATERIALS": len(material.present),

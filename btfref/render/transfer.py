@@ -47,6 +47,8 @@ class TransferSettings:
         ``shadows``.
     bits : {8, 32}
         Of a stored product: codes with four scales, or floats.
+    map_size : int
+        Texels a side of the products' parabolic maps over the views; the paper's is 16.
     seed : int
     """
 
@@ -55,10 +57,11 @@ class TransferSettings:
     shadows: bool = False
     bounces: int = 0
     bits: int = 32
+    map_size: int = 16
     seed: int = 0
 
     def __post_init__(self):
-        for name, least in (("clusters", 1), ("components", 1), ("bounces", 0)):
+        for name, least in (("clusters", 1), ("components", 1), ("bounces", 0), ("map_size", 2)):
             if not isinstance(getattr(self, name), int) or getattr(self, name) < least:
                 raise InputError(
                     "a setting of the transfer is out of range",

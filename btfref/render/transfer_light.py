@@ -17,9 +17,6 @@ from btfref.numerics import harmonics, interpolation
 from btfref.numerics.parabolic import bilinear_stencil, texel_directions
 from btfref.render.harmonic_light import shared_tables, table_coefficients
 
-#: Texels a side of a parabolic map over the views.
-SIZE = 16
-
 #: Components of the matrices and of the material while the light moves, as in the paper.
 MOVING = 4, 1
 
@@ -35,19 +32,21 @@ class Material:
     representation : Representation
         Of a method whose texels share tables.
     order : int
+    map_size : int
+        Texels a side of a parabolic map over the views.
     file : str, optional
         For messages.
     """
 
-    def __init__(self, representation, order, *, file=None):
+    def __init__(self, representation, order, *, map_size=16, file=None):
         _, cluster, weights = shared_tables(representation, "transfer_shader", file=file)
         # Clusters that no texel has are not computed.
         self.present, self.cluster = np.unique(cluster, return_inverse=True)
-        self.weights, self.order = weights, order
+        self.weights, self.order, self.map_size = weights, order, map_size
         self.representation = representation
         found = table_coefficients(representation, order, file=file)[self.present]
         views = interpolation.from_arrays(representation.arrays(), "view")
-        index, share = views.stencil(texel_directions(SIZE).reshape(-1, 3))
+        index, share = views.stencil(texel_directions(map_size).reshape(-1, 3))
         seen = sum(share[:, k, None, None, None] * found[:, index[:, k]] for k in range(index.shape[1]))
         # Channel, harmonic, then cluster, texel of the map and component: rows of a matrix product.
         seen = np.ascontiguousarray(seen.transpose(4, 2, 0, 1, 3), np.float32)
@@ -239,7 +238,7 @@ class TransferLight:
             if not len(at):
                 continue
             texel, texel_weight = conventions.texel_stencil(uv[at], meta["texels"], meta["filter_type"])
-            view, view_weight = bilinear_stencil(w_view[at], SIZE)
+            view, view_weight = bilinear_stencil(w_view[at], material.map_size)
             side = mirrored[at].astype(int)
             for corner in range(3):
                 own = self.transfer.cluster[triangle[at], corner]

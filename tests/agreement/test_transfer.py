@@ -47,7 +47,7 @@ def described(fits, name, **more):
             TransferSettings(clusters=12, components=5, shadows=True, bounces=1),
             marks=pytest.mark.long,
         ),
-        ("plane", TransferSettings()),
+        ("plane", TransferSettings(map_size=12)),
     ],
 )
 def test_pictures_equal_float64(fits, scene, settings):
@@ -58,7 +58,7 @@ def test_pictures_equal_float64(fits, scene, settings):
     classes = pixel_classes(scene_file(scene), parameters=parameters(fits), grid=1, size=SIZE)
     found = compare(image, exact, classes=classes, gate="image.float64", flip=False)
     assert found.passed, [gate.line for gate in found.gates]
-    facts = ("matrix_clusters", "table_bytes", "bits", "environment_shadows", "bounces")
+    facts = ("matrix_clusters", "table_bytes", "map_size", "bits", "environment_shadows", "bounces")
     assert {k: image.meta[k] for k in facts} == {k: exact.meta[k] for k in facts}
     assert image.meta["environment_shadows"] == settings.shadows
     if scene == "plane":
@@ -207,8 +207,22 @@ def test_a_moving_light_is_coarse_and_then_refined(fits):
         renderer.relight(other)
 
 
+def test_larger_maps_approach_harmonics(fits):
+    """With nothing lost in the matrices, the parabolic maps over the views are what is left."""
+    options = {"parameters": parameters(fits), "grid": 1, "size": SIZE, "order": 3}
+    exact = realtime(scene_file("plane"), environment="sh", **options).image
+
+    def error(size):
+        settings = TransferSettings(map_size=size)
+        image = realtime(scene_file("plane"), environment="transfer", transfer=settings, **options).image
+        return np.sqrt(np.mean((image - exact) ** 2)) / exact.mean()
+
+    coarse, fine = error(8), error(64)
+    assert fine < coarse / 4
+
+
 def test_settings_are_checked(fits):
-    for wrong in ({"clusters": 0}, {"bits": 16}, {"bounces": 1}, {"components": 2.5}):
+    for wrong in ({"clusters": 0}, {"bits": 16}, {"bounces": 1}, {"components": 2.5}, {"map_size": 1}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             TransferSettings(**wrong)
 
