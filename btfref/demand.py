@@ -138,7 +138,7 @@ def demand(
         For a scene that cannot be read.
     """
     from btfref.render.camera import film_rays, grid_offsets
-    from btfref.render.reference import loaded
+    from btfref.render.loading import loaded
     from btfref.render.scene import read_scene
 
     description = read_scene(scene, parameters, size=size, missing_btf=shape is not None)

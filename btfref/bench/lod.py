@@ -147,7 +147,7 @@ def _cost(path, rounds, tell):
     """Fetches and times of a plane that fills the picture, near and far."""
     import drjit as dr
 
-    from btfref.render import camera, reference
+    from btfref.render import camera, loading, reference
     from btfref.render.realtime import Renderer, realtime
     from btfref.render.scene import read_scene
     from btfref.scenes import scene_file
@@ -169,7 +169,7 @@ def _cost(path, rounds, tell):
     with contextlib.ExitStack() as stack:
         tasks = {}
         for k, p in parameters.items():
-            made = stack.enter_context(reference.loaded(file, p, size=LARGE))
+            made = stack.enter_context(loading.loaded(file, p, size=LARGE))
             camera.tell_camera(made, 1.0)
             tasks[k] = _reference_task(camera, reference, dr, made)
         raw["Mitsuba"] = interleaved(tasks, rounds)

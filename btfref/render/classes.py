@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from btfref.render.camera import film_rays, grid_offsets
-from btfref.render.reference import loaded
+from btfref.render.loading import loaded
 
 BACKGROUND, INTERIOR, SILHOUETTE, MESOSTRUCTURE = 0, 1, 2, 3
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from btfref.compare.tolerances import tolerance
 from btfref.render.camera import tell_camera
-from btfref.render.reference import BATCHES, loaded, traced
+from btfref.render.loading import loaded
+from btfref.render.reference import BATCHES, traced
 
 #: Samples a pixel of the first round, and most of all rounds.
 FIRST, MOST = 256, 1 << 16

@@ -15,7 +15,7 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.render.camera import film_rays
-from btfref.render.reference import loaded
+from btfref.render.loading import loaded
 from btfref.render.result import RenderResult
 from btfref.render.scene import read_scene
 

@@ -1,8 +1,4 @@
-"""The reference renderer: Mitsuba with any integrator, and noise-free direct light of delta lights.
-
-The film is always float32 with a box filter, so that a pixel is the plain mean of its samples: Mitsuba's
-default Gaussian filter mixes pixels and its float16 files round.
-"""
+"""The reference renderer: Mitsuba with any integrator, and noise-free direct light of delta lights."""
 
 from __future__ import annotations
 
@@ -11,8 +7,8 @@ import time
 import numpy as np
 
 from btfref.errors import BtfrefError, InputError
-from btfref.render import parsing
 from btfref.render.camera import film_rays, grid_offsets, tell_camera
+from btfref.render.loading import loaded
 from btfref.render.result import RenderResult
 from btfref.sampling.variant import no_collection
 
@@ -160,99 +156,6 @@ def traced(made, *, spp=None, seed=0, noise_free=None, shadows=True, with_varian
         **_versions(),
     }
     return RenderResult(image, variance, facts, pictures)
-
-
-class loaded:  # noqa: N801 - a context manager that reads as a verb
-    """``with loaded(scene, parameters, variant=…, size=…) as mitsuba_scene``; restores the variant.
-
-    ``plain`` loads the shapes alone: materials become diffuse, and BTF files need not exist. ``kept`` says which
-    maps are loaded: file to the materials' parameters ``views``, ``lights``, ``entries`` and ``levels``.
-    """
-
-    def __init__(self, scene, parameters=None, *, variant="llvm_ad_rgb", size=None, plain=False, kept=None):
-        self._arguments = scene, parameters, variant, size, plain, kept
-        self._before = None
-
-    def __enter__(self):
-        scene, parameters, variant, size, plain, kept = self._arguments
-        if variant.startswith("llvm"):
-            from btfref.platform import prepare_llvm
-
-            prepare_llvm()
-        import mitsuba as mi
-
-        self._before = mi.variant()
-        parsing.use_variant(variant)
-        try:
-            if "scalar" not in variant:
-                import mitsuba_plugins
-
-                mitsuba_plugins.register()
-            parsed = parsing.parse(scene, parameters, variant=variant, size=size, missing_btf=plain)
-            for index in [i for i, node in enumerate(parsed.nodes) if parsing.is_kind(node, "Film")]:
-                _plain_film(parsed, index)
-            btf_shapes = _btf_shapes(parsed)
-            if plain:
-                parsing.plain(parsed)
-            for node in parsed.nodes:
-                if kept and node.props.plugin_name() == parsing.BTF:
-                    for name, chosen in kept[node.props["filename"]].items():
-                        if chosen is not None:
-                            node.props[name] = " ".join(map(str, chosen))
-            made = parsed.instantiate()
-            if not isinstance(made, mi.Scene):
-                raise InputError("the file does not describe a scene", file=parsed.source)
-            _demand_texture_coordinates(made, btf_shapes)
-            if not made.sensors():
-                raise InputError("the scene has no sensor", file=parsed.source, field="sensor")
-            return made
-        except BaseException:
-            self.__exit__()
-            raise
-
-    def __exit__(self, *_):
-        if self._before is not None:
-            parsing.use_variant(self._before)
-
-
-def _btf_shapes(parsed):
-    """Identifier → place of every shape with a BTF; to be asked before instantiation consumes the tree."""
-
-    def shows_btf(node):
-        materials = [child for _, child in parsed.children(node) if parsing.is_kind(child, "BSDF")]
-        return any(node.props.plugin_name() == parsing.BTF or shows_btf(node) for node in materials)
-
-    shapes = [node for node in parsed.nodes if parsing.is_kind(node, "Shape") and shows_btf(node)]
-    return {node.props.id(): parsed.location(node) for node in shapes}
-
-
-def _demand_texture_coordinates(made, btf_shapes):
-    """Refuse meshes with a BTF but no uv: Mitsuba would use the triangles' barycentric coordinates."""
-    for shape in made.shapes():
-        if shape.id() in btf_shapes and shape.is_mesh() and not shape.has_vertex_texcoords():
-            place = btf_shapes[shape.id()]
-            raise InputError("the shape has no texture coordinates", file=place, field=shape.id())
-
-
-def _plain_film(parsed, index):
-    """Box filter and float32 RGB, whatever the scene says; ``index`` is the film's node."""
-    import mitsuba as mi
-
-    film = parsed.nodes[index]
-    film.props["component_format"] = "float32"
-    film.props["pixel_format"] = "rgb"
-    filters = [n for _, n in parsed.children(film) if parsing.is_kind(n, "ReconstructionFilter")]
-    for node in filters:
-        for key in list(node.props.keys()):
-            del node.props[key]
-        node.props.set_plugin_name("box")
-    if not filters:
-        node = mi.parser.SceneNode()
-        node.type = mi.ObjectType.ReconstructionFilter
-        node.props.set_plugin_name("box")
-        film.props["rfilter"] = mi.Properties.ResolvedReference(len(parsed.nodes))
-        # Last: the list may move, and then no node that was taken from it before is valid any longer.
-        parsed.nodes.append(node)
 
 
 def _monte_carlo(scene, spp, seed, with_variance, shadows):

@@ -114,7 +114,7 @@ def visible_points(scene, description, *, parameters=None, size=None, grid=4, pi
         For a shape without a BTF.
     """
     from btfref.render.camera import film_rays, grid_offsets
-    from btfref.render.reference import loaded
+    from btfref.render.loading import loaded
 
     for mesh in description.meshes:
         if mesh.material is None:

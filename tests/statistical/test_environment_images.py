@@ -16,8 +16,9 @@ from btfref.registry import methods
 from btfref.render.classes import pixel_classes
 from btfref.render.converged import converged
 from btfref.render.direct_light import regular
+from btfref.render.loading import loaded
 from btfref.render.realtime import realtime
-from btfref.render.reference import loaded, render
+from btfref.render.reference import render
 from btfref.scenes import scene_file
 
 SCENES = ("plane", "sphere", "cloth")
