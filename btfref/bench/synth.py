@@ -3,6 +3,9 @@
 The naive loop is what people write: ``mi.render`` once per view-light pair, with the scene loaded once, one mesh
 per material, and the light moved between renders; its time is extrapolated from a random subset of pairs. The
 error of each method is measured at pairs for which a much longer reference is rendered.
+
+Whether a method is biased is judged by the images' means. Their noise is the spread of independent runs: most of it may
+come from a handful of texels out of all, so that what one image shows of its own noise is often too little.
 """
 
 from __future__ import annotations
@@ -13,18 +16,27 @@ import statistics
 import subprocess
 import sys
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 
 from btfref.bench.data import MESOSTRUCTURES
+from btfref.bench.synth_methods import MAX_DEPTH, NAIVE_PAIRS, PAIRS, PATH_VIEWS, REFERENCE_SPP
 from btfref.bench.timing import machine
+from btfref.errors import InputError
 
-#: Samples of the naive loop and of paths.
+#: Samples of the naive loop and of paths: the classes of equal error.
 SAMPLES = (16, 64)
 
 #: Surface points a texel for about the errors of these samples. Errors stand beside the times.
 POINTS = {"checker": (10, 30), "rings": (25, 80), "tissue": (18, 60)}
+
+#: Independent runs whose spread is the noise of an image's mean; the timed rounds are among them.
+RUNS = {"naive": 12, "path": 8, "surface": 12}
+
+#: Significance of the z-test of a method's image means, taken together.
+SIGNIFICANCE = 0.01
 
 #: Growth of the cost: what is varied -> its values. The others stay at `BASE`.
 GROWTH = {
@@ -34,13 +46,8 @@ GROWTH = {
 }
 BASE = {"mesostructure": "checker", "texels": 64, "directions": "ubo81", "max_depth": 8, "spp": 10}
 
-#: Views of the slow shared-path estimator that stand for all of them in its time.
-PATH_VIEWS = 8
-
-PAIRS, SEEDS, MAX_DEPTH, REFERENCE_SPP = 12, 3, 8, 2048
-
-#: Pairs that the naive loop is timed on.
-NAIVE_PAIRS = 24
+#: What a step takes, roughly and in any unit, for the time left: a render of 16 samples, 16 paths, 16 points.
+COST = {"naive": 1, "path": 10, "surface": 10}
 
 
 def run(*, quick=False, progress=None, only=None, btf=None):
@@ -49,7 +56,7 @@ def run(*, quick=False, progress=None, only=None, btf=None):
     Parameters
     ----------
     quick : bool
-        The checker at 16² texels, one round.
+        The checker at 16² texels, one round, few runs; the growth at small sizes.
     progress : callable, optional
     only : iterable of str, optional
         Mesostructures instead of all; "growth" for the growth of the cost alone.
@@ -59,60 +66,112 @@ def run(*, quick=False, progress=None, only=None, btf=None):
     Returns
     -------
     dict
-        ``raw``: seconds of every round per mesostructure and method; ``kernel_s``, those of the naive loop
-        that its kernels take; ``errors``; ``peak_bytes``; ``growth``: one row per setting; ``parameters``;
-        ``machine``.
+        ``summary``: one row per mesostructure and method, see `summary`; ``raw``: seconds of every round per
+        mesostructure and method; ``kernel_s``, those of the naive loop that its kernels take; ``errors``;
+        ``means``: the images' means of every run, and ``reference``, those of the reference's rounds;
+        ``peak_bytes``; ``growth``: one row per setting; ``parameters``; ``machine``.
+
+    Raises
+    ------
+    InputError
+        For a name in ``only`` that there is not.
     """
-    names = list(only or (("checker",) if quick else (*MESOSTRUCTURES, "growth")))
-    growing = "growth" in names
+    names = list(only or (*(MESOSTRUCTURES[:1] if quick else MESOSTRUCTURES), "growth"))
+    for name in set(names) - {*MESOSTRUCTURES, "growth"}:
+        known = ", ".join((*MESOSTRUCTURES, "growth"))
+        raise InputError("no such mesostructure", field="--only", got=name, expected=known)
+    settings = _growing(quick) if "growth" in names else []
     names = [name for name in names if name != "growth"]
     rounds, texels = (1, 16) if quick else (3, 64)
-    result = {"raw": {}, "errors": {}, "peak_bytes": {}, "kernel_s": {}}
-    settings = _growing(quick) if growing else []
-    total, done = len(names) * (1 + rounds * 3 * len(SAMPLES)) + len(settings), 0
+    count = dict.fromkeys(RUNS, 4) if quick else RUNS
+    steps = _Steps(progress, names, settings, rounds, count)
+    result = {"raw": {}, "errors": {}, "means": {}, "reference": {}, "peak_bytes": {}, "kernel_s": {}}
     with tempfile.TemporaryDirectory() as folder:
         for name in names:
-            reference = Path(folder) / f"{name}.npz"
-            _child({"task": "reference", "mesostructure": name, "texels": texels, "out": str(reference)})
-            done += 1
-            raw, errors, peak, kernels = {}, {}, {}, {}
-            for seed in range(rounds):
-                for label, (method, spp) in methods(name).items():
-                    job = {"task": method, "mesostructure": name, "texels": texels, "spp": spp, "seed": seed}
-                    answer = _child(job | {"reference": str(reference)})
-                    raw.setdefault(label, []).append(answer["seconds"])
-                    errors.setdefault(label, []).append(answer["errors"])
-                    if "kernel_s" in answer:
-                        kernels.setdefault(label, []).append(answer["kernel_s"])
-                    peak[label] = max(peak.get(label, 0), answer["peak_bytes"])
-                    done += 1
-                    if progress is not None:
-                        progress(done, total, f"{name}, {label}")
-            result["raw"][name], result["errors"][name], result["peak_bytes"][name] = raw, errors, peak
-            result["kernel_s"][name] = kernels
+            job = {"mesostructure": name, "texels": texels, "reference": str(Path(folder) / f"{name}.npz")}
+            with _Process(job | {"task": "reference"}) as process:
+                result["reference"][name] = process.answer()["means"]
+            steps.add("reference", 0)
+            for key, value in _measured(job, rounds, count, steps).items():
+                result[key][name] = value
     growth = []
     for setting in settings:
-        growth.append(setting | _child({"task": "growth", **setting}))
-        done += 1
-        if progress is not None:
-            progress(done, total, "growth of the cost")
+        with _Process(setting | {"task": "growth"}) as process:
+            growth.append(setting | process.answer())
+        steps.add("growth", setting)
     result["growth"] = growth
     parameters = {
         "texels": texels,
         "directions": "ubo81 × ubo81",
         "max_depth": MAX_DEPTH,
         "rounds": rounds,
+        "runs": count,
         "pairs": PAIRS,
+        "significance": SIGNIFICANCE,
+        "z_limit": z_limit(),
         "reference_spp": REFERENCE_SPP,
         "naive_pairs": NAIVE_PAIRS,
+        "path_views": PATH_VIEWS,
     }
-    return {"suite": "synth", "parameters": parameters, "machine": machine(), **result}
+    rows = summary(result)
+    return {"suite": "synth", "parameters": parameters, "machine": machine(), "summary": rows, **result}
 
 
 def methods(name):
-    """Label -> estimator and samples, for one mesostructure."""
+    """Label -> estimator, samples and class of equal error, for one mesostructure."""
     spp = {"naive": SAMPLES, "path": SAMPLES, "surface": POINTS[name]}
-    return {f"{key} {count}": (key, count) for key, counts in spp.items() for count in counts}
+    return {f"{key} {n}": (key, n, level) for key, counts in spp.items() for level, n in enumerate(counts)}
+
+
+def _measured(job, rounds, count, steps):
+    """All methods of one mesostructure in turn: parts of the result by label."""
+    parts = {"raw": {}, "errors": {}, "means": {}, "peak_bytes": {}, "kernel_s": {}}
+    with ExitStack() as stack:
+        processes = {}
+        for label, (task, spp, _) in methods(job["mesostructure"]).items():
+            processes[label] = stack.enter_context(_Process(job | {"task": task, "spp": spp}))
+        for seed in range(max(count.values())):
+            for label, (task, spp, _) in methods(job["mesostructure"]).items():
+                if seed >= count[task]:
+                    continue
+                timed = seed < rounds
+                answer = processes[label].answer({"seed": seed, "timed": timed})
+                parts["means"].setdefault(label, []).append(answer["means"])
+                if timed:
+                    parts["raw"].setdefault(label, []).append(answer["seconds"])
+                    parts["errors"].setdefault(label, []).append(answer["errors"])
+                    parts["peak_bytes"][label] = answer["peak_bytes"]
+                    if "kernel_s" in answer:
+                        parts["kernel_s"].setdefault(label, []).append(answer["kernel_s"])
+                steps.add(task, spp)
+    return parts
+
+
+class _Steps:
+    """Steps done of all, weighed by what they take so that the time left can be told from them."""
+
+    def __init__(self, progress, names, settings, rounds, count):
+        self.progress, self.done = progress, 0
+        self.total = sum(_cost("reference", 0) for _ in names) + sum(_cost("growth", s) for s in settings)
+        for name in names:
+            self.total += sum(count[task] * _cost(task, spp) for task, spp, _ in methods(name).values())
+        self.add(None, 0)
+
+    def add(self, task, what):
+        """Count a step; the first call shows where it starts."""
+        self.done += _cost(task, what) if task else 0
+        if self.progress is not None:
+            # One label throughout: the bar's clock starts anew with each.
+            self.progress(self.done, self.total, "synthesis")
+
+
+def _cost(task, what):
+    """Relative time of a step; ``what`` is a number of samples, or a setting of the growth."""
+    if task == "reference":
+        return 10 * COST["naive"]
+    if task == "growth":
+        return COST["surface"] * max(1, (what["texels"] // 64) ** 2)
+    return max(1, COST[task] * what // 16)
 
 
 def _growing(quick):
@@ -122,40 +181,128 @@ def _growing(quick):
     return [row for row in rows if not quick or row["texels"] <= 32]
 
 
-def table(result):
-    """Header and rows for a reader."""
-    header = [
-        "mesostructure",
-        "method",
-        "s",
-        "RMSE",
-        "RMSE w/o 1 %",
-        "MAE",
-        "|z| of means",
-        "× naive 16",
-        "× its kernels",
-        "MiB",
-    ]
+# --- what is made of the figures
+
+
+def z_limit(significance=SIGNIFICANCE, n_tests=PAIRS):
+    """|z| that the largest of some standard normals exceeds with a probability (Šidák 1967)."""
+    from scipy import special
+
+    from btfref.compare.significance import sidak
+
+    return float(-special.ndtri(sidak(significance, n_tests) / 2))
+
+
+def bias(runs, reference):
+    """Deviation of the images' means from the reference's.
+
+    Parameters
+    ----------
+    runs, reference : array (n_runs, pairs), (n_rounds, pairs)
+        Means of independent images, two runs or more.
+
+    Returns
+    -------
+    dict
+        ``z``: of the means of all runs, the largest |z| of the pairs (Welch's test, as the normal z of the same
+        p-value); ``pairs_z``; ``limit``: see `z_limit`; ``seen``: relative deviations of the pairs' means that would
+        reach the limit; ``bias``: that of all pairs' mean, and ``half_width`` of its 95 % interval.
+    """
+    from scipy import special
+
+    from btfref.compare.significance import interval, welch_test
+
+    runs, reference = np.asarray(runs, np.float64), np.asarray(reference, np.float64)
+    n, m = len(runs), len(reference)
+    mine, theirs = runs.var(0, ddof=1) / n, reference.var(0, ddof=1) / m
+    truth = reference.mean(0)
+    _, p = welch_test(runs.mean(0), mine, truth, theirs, n_a=n, n_b=m)
+    z = -special.ndtri(np.maximum(p, 1e-300) / 2)
+    limit = z_limit(n_tests=runs.shape[1])
+    # Pairs share points and walks: the spread of whole runs holds what goes together.
+    whole, other = runs.mean(1), reference.mean(1)
+    error = np.sqrt(whole.var(ddof=1) / n + other.var(ddof=1) / m) / truth.mean()
+    found = interval(whole.mean() / truth.mean() - 1, error, confidence=0.95, freedom=n - 1)
+    # As wide as Welch's test is: Student's quantile.
+    freedom = (mine + theirs) ** 2 / (mine**2 / (n - 1) + theirs**2 / (m - 1))
+    wide = special.stdtrit(freedom, special.ndtr(limit))
+    return {
+        "z": float(z.max()),
+        "pairs_z": z.tolist(),
+        "limit": limit,
+        "seen": (wide * np.sqrt(mine + theirs) / truth).tolist(),
+        "bias": found.estimate,
+        "half_width": found.high - found.estimate,
+    }
+
+
+def summary(result):
+    """Figures of each mesostructure and method, computed from the raw ones.
+
+    Parameters
+    ----------
+    result : dict
+        Of `run`.
+
+    Returns
+    -------
+    list of dict
+        ``mesostructure``, ``method``; ``seconds``, and paired ratios to it of the naive loop (``naive``), of what its
+        kernels take (``kernels``) and of paths (``path``), of the samples whose error is asked for: ``[median, least,
+        largest]`` each; ``rmse``, ``trimmed``, ``mae``: medians of the rounds; ``equal_error``: whether none of
+        them is above the naive loop's; what `bias` tells; ``peak_bytes``.
+    """
     rows = []
     for name, raw in result["raw"].items():
-        naive = statistics.median(raw["naive 16"])
-        kernels = statistics.median(result["kernel_s"][name]["naive 16"])
+        labels = methods(name)
+        levels = [{label for label in labels if labels[label][2] == level} for level in range(len(SAMPLES))]
+        errors = {
+            label: {key: statistics.median(e[key] for e in some) for key in ("rmse", "trimmed", "mae")}
+            for label, some in result["errors"][name].items()
+        }
         for label, seconds in raw.items():
-            errors = result["errors"][name][label]
-            column = [statistics.median(e[key] for e in errors) for key in ("rmse", "trimmed", "mae")]
-            z = max(e["z"] for e in errors)
-            time = statistics.median(seconds)
-            peak = result["peak_bytes"][name][label] / 2**20
-            numbers = (*(f"{e:.4f}" for e in column), f"{z:.1f}", f"{naive / time:.1f}")
-            rows.append([name, label, f"{time:.2f}", *numbers, f"{kernels / time:.1f}", f"{peak:.0f}"])
+            level = next(k for k, some in enumerate(levels) if label in some)
+            naive = f"naive {SAMPLES[level]}"
+            peers = {
+                "naive": raw[naive],
+                "kernels": result["kernel_s"][name][naive],
+                "path": raw[f"path {SAMPLES[level]}"],
+            }
+            ratios = {key: [a / b for a, b in zip(some, seconds, strict=True)] for key, some in peers.items()}
+            spread = {"seconds": seconds} | ratios
+            rows.append(
+                {"mesostructure": name, "method": label}
+                | {key: [statistics.median(some), min(some), max(some)] for key, some in spread.items()}
+                | errors[label]
+                | {"equal_error": all(errors[label][key] <= e for key, e in errors[naive].items())}
+                | bias(result["means"][name][label], result["reference"][name])
+                | {"peak_bytes": result["peak_bytes"][name][label]}
+            )
+    return rows
+
+
+def table(result):
+    """Header and rows for a reader; ratios and seconds are medians with the least and the largest round."""
+    header = ["mesostructure", "method", "s", "RMSE", "RMSE w/o 1 %", "MAE"]
+    header += [f"|z| ≤ {result['parameters']['z_limit']:.1f}?", "seen from %", "bias %"]
+    header += ["naive / it", "its kernels / it", "paths / it", "MiB"]
+    rows = []
+    for row in result["summary"]:
+        seen = statistics.median(row["seen"])
+        cells = [row["mesostructure"], row["method"], _spread(row["seconds"], ".1f")]
+        cells += [f"{row[key]:.4f}" for key in ("rmse", "trimmed", "mae")]
+        cells += [f"{row['z']:.1f}", f"{100 * seen:.2f}"]
+        cells += [f"{100 * row['bias']:+.2f} ± {100 * row['half_width']:.2f}"]
+        cells += [_spread(row[key], ".3g") for key in ("naive", "kernels", "path")]
+        rows.append([*cells, f"{row['peak_bytes'] / 2**20:.0f}"])
     for row in result["growth"]:
         setting = f"surface {row['spp']}, {row['texels']}², {row['n_directions']}², depth {row['max_depth']}"
-        blank = [""] * 6
+        blank = [""] * (len(header) - 4)
         rows.append(
             [
                 row["mesostructure"],
                 setting,
-                f"{row['seconds']:.2f}",
+                f"{row['seconds']:.1f}",
                 *blank,
                 f"{row['peak_bytes'] / 2**20:.0f}",
             ]
@@ -163,222 +310,48 @@ def table(result):
     return header, rows
 
 
-def _child(job):
-    """Run one job in a clean process; what else a process holds slows Mitsuba and would fake a ratio."""
-    done = subprocess.run(
-        [sys.executable, "-m", "btfref.bench.synth", json.dumps(job)],
-        capture_output=True,
-        text=True,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        check=False,
-    )
-    if done.returncode:
-        raise RuntimeError(done.stderr.strip().splitlines()[-1])
-    return json.loads(done.stdout.splitlines()[-1])
+def _spread(values, form):
+    """Median (least … largest), or the one number that there is."""
+    middle, low, high = (f"{value:{form}}" for value in values)
+    return middle if low == high else f"{middle} ({low} … {high})"
 
 
-def pairs(n_views, n_lights):
-    """The pairs at which errors are measured: random, but the same in every run."""
-    rng = np.random.default_rng(2003)
-    index = rng.choice(n_views * n_lights, PAIRS, replace=False)
-    return np.stack([index // n_lights, index % n_lights], 1)
+class _Process:
+    """A process that does the jobs of one method; see `btfref.bench.synth_methods`."""
 
-
-class Naive:
-    """One `mi.render` per pair."""
-
-    def __init__(self, mi, mesostructure, texels):
-        from btfref.mesostructure import build
-
-        self.mi, self.texels = mi, texels
-        tile = build(mesostructure)
-        # Far enough for shadows from 75 degrees.
-        reach = 1 + int(np.ceil(-tile.height[0] * np.tan(np.radians(75))))
-        light = {"type": "directional", "direction": [0, 0, -1], "irradiance": 1.0}
-        self.scene = mi.load_dict({"type": "scene", "light": light, **_merged(mi, tile, reach)})
-        self.parameters = mi.traverse(self.scene)
-        self.integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH})
-
-    def __call__(self, view, light, spp, seed):
-        """Render one pair: (texels, texels, 3) float32."""
-        mi = self.mi
-        up = [0, 1, 0] if abs(light[1]) < 0.9 else [1, 0, 0]
-        self.parameters["light.to_world"] = mi.Transform4f().look_at([0, 0, 0], (-light).tolist(), up)
-        self.parameters.update()
-        image = mi.render(
-            self.scene, sensor=_camera(mi, view, self.texels), integrator=self.integrator, spp=spp, seed=seed
+    def __init__(self, job):
+        self._errors = tempfile.TemporaryFile("w+")
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "btfref.bench.synth_methods", json.dumps(job)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            text=True,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         )
-        return np.array(image)
 
+    def __enter__(self):
+        return self
 
-def _merged(mi, tile, reach):
-    """All copies of the tile as one mesh per material: the fastest that we know for a plain render."""
-    shapes = {}
-    offsets = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2), -1).reshape(-1, 2)
-    for index, part in enumerate(tile.parts):
-        n = len(part.vertices)
-        uv = part.vertices[:, :2] if part.uv is None else part.uv
-        properties = mi.Properties()
-        properties["material"] = mi.load_dict(part.bsdf)
-        mesh = mi.Mesh(
-            f"part_{index}",
-            n * len(offsets),
-            len(part.faces) * len(offsets),
-            has_vertex_normals=part.normals is not None,
-            has_vertex_texcoords=True,
-            props=properties,
-        )
-        values = mi.traverse(mesh)
-        moved = np.concatenate([part.vertices + np.append(offset, 0) for offset in offsets])
-        values["vertex_positions"] = moved.astype(np.float32).ravel()
-        faces = np.concatenate([part.faces + np.uint32(n * copy) for copy in range(len(offsets))])
-        values["faces"] = faces.astype(np.uint32).ravel()
-        if part.normals is not None:
-            values["vertex_normals"] = np.tile(part.normals, (len(offsets), 1)).astype(np.float32).ravel()
-        values["vertex_texcoords"] = np.tile(uv, (len(offsets), 1)).astype(np.float32).ravel()
-        values.update()
-        shapes[f"part_{index}"] = mesh
-    return shapes
+    def __exit__(self, *_):
+        self._process.kill()
+        self._process.wait()
+        for stream in (self._process.stdin, self._process.stdout, self._errors):
+            stream.close()
 
-
-def _camera(mi, view, texels):
-    """An orthographic camera sheared so that pixels are the texels' squares on z = 0."""
-    matrix = np.eye(4)
-    matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = [-0.5, 0, 0], [0, -0.5, 0], -view
-    matrix[:3, 3] = np.array([0.5, 0.5, 0]) + 2 * view
-    film = {
-        "type": "hdrfilm",
-        "width": texels,
-        "height": texels,
-        "rfilter": {"type": "box"},
-        "pixel_format": "rgb",
-        "component_format": "float32",
-    }
-    return mi.load_dict({"type": "orthographic", "to_world": mi.ScalarTransform4f(matrix), "film": film})
-
-
-def _errors(values, data):
-    """Errors at the reference pairs: (pairs, texels, texels, 3) against mean and variance."""
-    reference, variance = data["mean"], data["variance"]
-    square = (values - reference) ** 2 - variance  # the reference's own noise taken off
-    flat = np.sort(((values - reference) ** 2).reshape(-1))
-    kept = flat[: int(0.99 * len(flat))]
-    image = values.mean((1, 2, 3)) - reference.mean((1, 2, 3))
-    # The reference's noise and that of the values, whose texels are taken as independent.
-    noise = np.sqrt(3 * (square.clip(0) + 2 * variance).sum((1, 2, 3))) / reference[0].size
-    return {
-        "rmse": float(np.sqrt(max(square.mean(), 0))),
-        "trimmed": float(np.sqrt(kept.mean())),
-        "mae": float(np.abs(values - reference).mean()),
-        "z": float(np.abs(image / noise).max()),
-        "bias": float(image.sum() / reference.mean((1, 2, 3)).sum()),
-    }
-
-
-def _task(job):
-    """One job of `_child`."""
-    import resource
-    import time
-
-    from btfref.numerics.directions import directions
-    from btfref.sampling.synthesis import synthesize
-    from btfref.sampling.variant import mitsuba_variant
-
-    if job["task"] == "growth":
-        return _growth(job)
-    vectors, texels = directions("ubo81").vectors, job["texels"]
-    kernel_s = None
-    chosen = pairs(len(vectors), len(vectors))
-    if job["task"] in ("naive", "reference"):
-        with mitsuba_variant("llvm_ad_rgb") as mi:
-            render = Naive(mi, job["mesostructure"], texels)
-            if job["task"] == "reference":
-                rounds = 16
-                images = np.stack(
-                    [
-                        [
-                            render(vectors[v], vectors[k], REFERENCE_SPP // rounds, 1000 * r + i)
-                            for i, (v, k) in enumerate(chosen)
-                        ]
-                        for r in range(rounds)
-                    ]
-                ).astype(np.float64)
-                np.savez(job["out"], mean=images.mean(0), variance=images.var(0, ddof=1) / rounds)
-                return {}
-            rng = np.random.default_rng(job["seed"])
-            some = rng.integers(0, len(vectors), (NAIVE_PAIRS + 3, 2))
-            import drjit as dr
-
-            times, kernels = [], []
-            for i, (v, k) in enumerate(some):
-                start = time.perf_counter()
-                render(vectors[v], vectors[k], job["spp"], i)
-                times.append(time.perf_counter() - start)
-            seconds = statistics.mean(times[3:]) * len(vectors) ** 2
-            with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-                for i, (v, k) in enumerate(some):
-                    dr.kernel_history_clear()
-                    render(vectors[v], vectors[k], job["spp"], i)
-                    kernels.append(sum(entry["execution_time"] for entry in dr.kernel_history()))
-            kernel_s = statistics.mean(kernels[3:]) / 1e3 * len(vectors) ** 2
-            values = np.stack(
-                [
-                    render(vectors[v], vectors[k], job["spp"], 77 + job["seed"] * 100 + i)
-                    for i, (v, k) in enumerate(chosen)
-                ]
-            )
-    else:
-        settings = {"texels": texels, "spp": job["spp"], "estimator": job["task"], "max_depth": MAX_DEPTH}
-        # Warm kernels; a path takes long, its views cost about the same and its kernels are warm after some.
-        path = job["task"] == "path"
-        everything = np.unique(np.concatenate([chosen[:, 0], np.linspace(0, 80, PATH_VIEWS).astype(int)]))
-        used = everything if path else np.arange(len(vectors))
-        for warm in (True, False):
-            # The warm-up's result is dropped first: memory is touched anew otherwise, and the peak is that of two.
-            btf = None
-            views = vectors[used[:4]] if warm and path else vectors[used]
-            start = time.perf_counter()
-            # Images alone, as the naive loop makes them.
-            btf = synthesize(job["mesostructure"], views=views, lights=vectors, seed=job["seed"],
-                             dtype="float32", variance=False, **settings)  # fmt: skip
-            seconds = (time.perf_counter() - start) * len(vectors) / len(views)
-        values = btf.values[np.searchsorted(used, chosen[:, 0]), chosen[:, 1]]
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    with np.load(job["reference"]) as data:
-        answer = {"seconds": seconds, "peak_bytes": peak, "errors": _errors(values.astype(np.float64), data)}
-    return answer if kernel_s is None else answer | {"kernel_s": kernel_s}
-
-
-def _growth(job):
-    """Time and memory of one setting, results not kept: what a store would be given view by view."""
-    import gc
-    import resource
-    import time
-
-    from btfref.mesostructure import build
-    from btfref.numerics.directions import directions
-    from btfref.sampling.surface_estimator import SurfaceEstimator
-    from btfref.sampling.variant import mitsuba_variant
-
-    vectors = directions(job["directions"]).vectors
-    tile = build(job["mesostructure"])
-    with mitsuba_variant("llvm_ad_rgb"):
-        for _ in range(2):
-            # The first run compiles kernels, whose constants are those of this setting. Its BSDFs must be gone
-            # before the second one starts: two scenes are other kernels.
-            estimator = None
-            gc.collect()
-            start = time.perf_counter()
-            estimator = SurfaceEstimator(
-                tile, vectors, views=vectors, texels=(job["texels"],) * 2, spp=job["spp"], seed=0,
-                max_depth=job["max_depth"], variance=False,
-            )  # fmt: skip
-            for _ in estimator.all_views(range(len(vectors))):
-                pass
-            seconds = time.perf_counter() - start
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    return {"seconds": seconds, "peak_bytes": peak, "n_directions": len(vectors)}
-
-
-if __name__ == "__main__":
-    sys.stdout.write(json.dumps(_task(json.loads(sys.argv[1]))) + "\n")
+    def answer(self, order=None):
+        """Send an order, if any, and wait for the answer."""
+        line = ""
+        try:
+            if order is not None:
+                self._process.stdin.write(json.dumps(order) + "\n")
+                self._process.stdin.flush()
+            line = self._process.stdout.readline()
+        except BrokenPipeError:
+            pass  # told below
+        if not line:
+            self._process.wait()
+            self._errors.seek(0)
+            lines = self._errors.read().strip().splitlines()
+            raise RuntimeError(lines[-1] if lines else f"exit status {self._process.returncode}")
+        return json.loads(line)

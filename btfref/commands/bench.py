@@ -141,6 +141,10 @@ def _suite(args):
     if plot and args.suite != "synth" and not hasattr(suite, "plot"):
         raise InputError("this suite has no plot", field="--plot", got=args.suite, expected="env or synth")
     options = {"only": _only(args)} if args.only else {}
+    if plot and args.suite == "synth" and args.only and "growth" not in _only(args):
+        raise InputError(
+            "the plot is that of the growth", field="--only", got=args.only, expected="growth too"
+        )
     if args.report:
         options["report"] = output_file(args.report, ".html")
         if "report" not in inspect.signature(suite.run).parameters:

@@ -1,0 +1,342 @@
+"""What the synthesis benchmark times: each method in a process of its own that answers orders, one line of JSON each.
+
+What else a process holds slows Mitsuba and would fake a ratio. The process of a method lives on between rounds, so that
+its kernels are compiled once and methods take turns.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import statistics
+import sys
+import time
+
+import numpy as np
+
+from btfref.numerics.directions import directions
+
+#: Pairs at which errors are measured.
+PAIRS = 12
+
+#: As in Mitsuba's path integrator, of all methods.
+MAX_DEPTH = 8
+
+#: Samples and rounds of the reference; the rounds tell its noise.
+REFERENCE_SPP, REFERENCE_ROUNDS = 2048, 16
+
+#: Pairs that the naive loop is timed on, after some that warm up.
+NAIVE_PAIRS, NAIVE_WARM = 24, 3
+
+#: Views of the slow shared-path estimator that stand for all of them in its time.
+PATH_VIEWS = 8
+
+
+def pairs(n_views, n_lights):
+    """The pairs at which errors are measured: random, but the same in every run."""
+    rng = np.random.default_rng(2003)
+    index = rng.choice(n_views * n_lights, PAIRS, replace=False)
+    return np.stack([index // n_lights, index % n_lights], 1)
+
+
+class Naive:
+    """One `mi.render` per pair."""
+
+    def __init__(self, mi, mesostructure, texels):
+        from btfref.mesostructure import build
+
+        self.mi, self.texels = mi, texels
+        tile = build(mesostructure)
+        # Far enough for shadows from 75 degrees.
+        reach = 1 + int(np.ceil(-tile.height[0] * np.tan(np.radians(75))))
+        light = {"type": "directional", "direction": [0, 0, -1], "irradiance": 1.0}
+        self.scene = mi.load_dict({"type": "scene", "light": light, **_merged(mi, tile, reach)})
+        self.parameters = mi.traverse(self.scene)
+        self.integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH})
+
+    def __call__(self, view, light, spp, seed):
+        """Render one pair: (texels, texels, 3) float32."""
+        mi = self.mi
+        up = [0, 1, 0] if abs(light[1]) < 0.9 else [1, 0, 0]
+        self.parameters["light.to_world"] = mi.Transform4f().look_at([0, 0, 0], (-light).tolist(), up)
+        self.parameters.update()
+        image = mi.render(
+            self.scene, sensor=_camera(mi, view, self.texels), integrator=self.integrator, spp=spp, seed=seed
+        )
+        return np.array(image)
+
+
+def _merged(mi, tile, reach):
+    """All copies of the tile as one mesh per material: the fastest that we know for a plain render."""
+    shapes = {}
+    offsets = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2), -1).reshape(-1, 2)
+    for index, part in enumerate(tile.parts):
+        n = len(part.vertices)
+        uv = part.vertices[:, :2] if part.uv is None else part.uv
+        properties = mi.Properties()
+        properties["material"] = mi.load_dict(part.bsdf)
+        mesh = mi.Mesh(
+            f"part_{index}",
+            n * len(offsets),
+            len(part.faces) * len(offsets),
+            has_vertex_normals=part.normals is not None,
+            has_vertex_texcoords=True,
+            props=properties,
+        )
+        values = mi.traverse(mesh)
+        moved = np.concatenate([part.vertices + np.append(offset, 0) for offset in offsets])
+        values["vertex_positions"] = moved.astype(np.float32).ravel()
+        faces = np.concatenate([part.faces + np.uint32(n * copy) for copy in range(len(offsets))])
+        values["faces"] = faces.astype(np.uint32).ravel()
+        if part.normals is not None:
+            values["vertex_normals"] = np.tile(part.normals, (len(offsets), 1)).astype(np.float32).ravel()
+        values["vertex_texcoords"] = np.tile(uv, (len(offsets), 1)).astype(np.float32).ravel()
+        values.update()
+        shapes[f"part_{index}"] = mesh
+    return shapes
+
+
+def _camera(mi, view, texels):
+    """An orthographic camera sheared so that pixels are the texels' squares on z = 0."""
+    matrix = np.eye(4)
+    matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = [-0.5, 0, 0], [0, -0.5, 0], -view
+    matrix[:3, 3] = np.array([0.5, 0.5, 0]) + 2 * view
+    film = {
+        "type": "hdrfilm",
+        "width": texels,
+        "height": texels,
+        "rfilter": {"type": "box"},
+        "pixel_format": "rgb",
+        "component_format": "float32",
+    }
+    return mi.load_dict({"type": "orthographic", "to_world": mi.ScalarTransform4f(matrix), "film": film})
+
+
+def errors(values, reference, variance):
+    """Errors of images (pairs, texels, texels, 3) against a reference with its variance of the same shape."""
+    square = (values - reference) ** 2
+    kept = np.sort(square.reshape(-1))[: int(0.99 * square.size)]
+    return {
+        "rmse": float(np.sqrt(max((square - variance).mean(), 0))),  # the reference's own noise taken off
+        "trimmed": float(np.sqrt(kept.mean())),
+        "mae": float(np.abs(values - reference).mean()),
+    }
+
+
+class _Subject:
+    """A method: ``time(seed)`` tells seconds of a whole BTF, ``images(seed)`` makes the images of the pairs."""
+
+    def __init__(self, mi, job):
+        from btfref.mesostructure import build
+
+        self.mi, self.job, self.texels, self.spp = mi, job, job["texels"], job.get("spp")
+        self.vectors = directions("ubo81").vectors
+        self.tile = build(job["mesostructure"])
+        self.pairs = pairs(len(self.vectors), len(self.vectors))
+        self.views, self.view = np.unique(self.pairs[:, 0], return_inverse=True)
+        self.lights, self.light = np.unique(self.pairs[:, 1], return_inverse=True)
+        self.settings = {"texels": (self.texels,) * 2, "spp": self.spp, "max_depth": MAX_DEPTH}
+
+    def _chosen(self, estimator):
+        """Images of the pairs from an estimator of their lights."""
+        found = {view: mean for view, mean, _ in estimator.all_views(self.views.tolist())}
+        return np.stack(
+            [found[int(view)][light] for view, light in zip(self.pairs[:, 0], self.light, strict=True)]
+        )
+
+
+class NaiveLoop(_Subject):
+    """One `mi.render` per pair; its time is extrapolated from random pairs."""
+
+    def __init__(self, mi, job):
+        super().__init__(mi, job)
+        self.render = Naive(mi, job["mesostructure"], self.texels)
+
+    def _some(self, seed):
+        return np.random.default_rng(seed).integers(0, len(self.vectors), (NAIVE_WARM + NAIVE_PAIRS, 2))
+
+    def time(self, seed):
+        """Seconds of the loop, and of its kernels alone."""
+        import drjit as dr
+
+        vectors, times, kernels = self.vectors, [], []
+        for i, (v, k) in enumerate(self._some(seed)):
+            start = time.perf_counter()
+            self.render(vectors[v], vectors[k], self.spp, i)
+            times.append(time.perf_counter() - start)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            for i, (v, k) in enumerate(self._some(seed)):
+                dr.kernel_history_clear()
+                self.render(vectors[v], vectors[k], self.spp, i)
+                kernels.append(sum(entry["execution_time"] for entry in dr.kernel_history()) / 1e3)
+        every = len(vectors) ** 2
+        parts = {"seconds": times, "kernel_s": kernels}
+        return {name: statistics.mean(some[NAIVE_WARM:]) * every for name, some in parts.items()}
+
+    def images(self, seed):
+        """Images of the pairs, with random numbers that neither the reference nor another seed has."""
+        first = 100_000 + 100 * seed
+        return np.stack(
+            [
+                self.render(self.vectors[v], self.vectors[k], self.spp, first + i)
+                for i, (v, k) in enumerate(self.pairs)
+            ]
+        )
+
+
+class Reference(NaiveLoop):
+    """The same loop with many samples, in rounds whose spread tells its noise."""
+
+    def __init__(self, mi, job):
+        super().__init__(mi, job)
+        self.spp = REFERENCE_SPP // REFERENCE_ROUNDS
+
+    def save(self):
+        """Write mean and variance of the mean; means of the images of every round."""
+        total, squares, means = 0.0, 0.0, []
+        for seed in range(-REFERENCE_ROUNDS, 0):
+            images = self.images(seed).astype(np.float64)
+            total, squares = total + images, squares + images**2
+            means.append(images.mean((1, 2, 3)).tolist())
+        n = REFERENCE_ROUNDS
+        variance = np.maximum(squares - total**2 / n, 0) / (n * (n - 1))
+        np.savez(self.job["reference"], mean=total / n, variance=variance)
+        return {"means": means}
+
+
+class SharedPaths(_Subject):
+    """`PathEstimator`, its variances left out; its time is that of some views."""
+
+    def __init__(self, mi, job):
+        super().__init__(mi, job)
+        self.time(0, 2)
+
+    def _made(self, lights, seed):
+        from btfref.sampling.path_estimator import PathEstimator
+
+        class Images(PathEstimator):
+            def _statistics(self, n_lit, n_texels):
+                import drjit as dr
+
+                mean = dr.block_sum(self._buffer, self.spp) / self.spp
+                return mean.numpy().reshape(n_lit, 3, n_texels).transpose(0, 2, 1), 0
+
+        gc.collect()  # the materials of the scene before would make other kernels
+        return Images(self.tile, self.vectors[lights], views=self.vectors, seed=seed, **self.settings)
+
+    def time(self, seed, n_views=PATH_VIEWS):
+        """Seconds: those of what is done once, and those of some views times what they stand for."""
+        n = len(self.vectors)
+        start = time.perf_counter()
+        estimator = self._made(range(n), seed)
+        made = time.perf_counter()
+        for _ in estimator.all_views(np.linspace(0, n - 1, n_views).astype(int).tolist()):
+            pass
+        return {"seconds": made - start + (time.perf_counter() - made) * n / n_views}
+
+    def images(self, seed):
+        """Images of the pairs: what a view gets does not depend on which lights there are."""
+        return self._chosen(self._made(self.lights, seed))
+
+
+class SharedPoints(_Subject):
+    """The surface estimator, timed as a whole."""
+
+    def __init__(self, mi, job):
+        super().__init__(mi, job)
+        self.full = {}
+        self.time(0)
+
+    def time(self, seed):
+        """Seconds of a whole BTF in memory: images alone, as the naive loop makes them."""
+        from btfref.sampling.synthesis import synthesize
+
+        gc.collect()
+        start = time.perf_counter()
+        btf = synthesize(self.job["mesostructure"], texels=self.texels, spp=self.spp, estimator="surface",
+                         views=self.vectors, lights=self.vectors, max_depth=MAX_DEPTH, seed=seed,
+                         dtype="float32", variance=False)  # fmt: skip
+        seconds = time.perf_counter() - start
+        self.full[seed] = btf.values[self.pairs[:, 0], self.pairs[:, 1]]
+        return {"seconds": seconds}
+
+    def images(self, seed):
+        """Images of the pairs, of the whole BTF where it was made; else points and walks of their directions alone."""
+        from btfref.sampling.surface_estimator import SurfaceEstimator
+
+        if seed in self.full:
+            return self.full[seed]
+        gc.collect()
+        settings = self.settings | {"wanted": self.views, "variance": False, "seed": seed}
+        return self._chosen(
+            SurfaceEstimator(self.tile, self.vectors[self.lights], views=self.vectors, **settings)
+        )
+
+
+SUBJECTS = {"naive": NaiveLoop, "path": SharedPaths, "surface": SharedPoints}
+
+
+def _answers(mi, job):
+    """What a method's process answers: one dict for each order that comes in."""
+    subject = SUBJECTS[job["task"]](mi, job)
+    with np.load(job["reference"]) as data:
+        reference, variance = data["mean"], data["variance"]
+    for order in map(json.loads, sys.stdin):
+        answer = subject.time(order["seed"]) if order["timed"] else {}
+        peak = _peak()
+        values = subject.images(order["seed"]).astype(np.float64)
+        if order["timed"]:
+            answer |= {"errors": errors(values, reference, variance), "peak_bytes": peak}
+        yield answer | {"means": values.mean((1, 2, 3)).tolist()}
+
+
+def _peak():
+    """Largest amount of memory that this process had so far, bytes."""
+    from btfref.sampling.memory import peak
+
+    return peak()
+
+
+def _growth(job):
+    """Time and memory of one setting, results not kept: what a store would be given view by view."""
+    from btfref.mesostructure import build
+    from btfref.sampling.surface_estimator import SurfaceEstimator
+
+    vectors = directions(job["directions"]).vectors
+    tile = build(job["mesostructure"])
+    for _ in range(2):
+        # The first run compiles kernels, whose constants are those of this setting. Its BSDFs must be gone
+        # before the second one starts: two scenes are other kernels.
+        estimator = None
+        gc.collect()
+        start = time.perf_counter()
+        estimator = SurfaceEstimator(
+            tile, vectors, views=vectors, texels=(job["texels"],) * 2, spp=job["spp"], seed=0,
+            max_depth=job["max_depth"], variance=False,
+        )  # fmt: skip
+        for _ in estimator.all_views(range(len(vectors))):
+            pass
+        seconds = time.perf_counter() - start
+    return {"seconds": seconds, "peak_bytes": _peak(), "n_directions": len(vectors)}
+
+
+def main(job):
+    """Carry out a job, with answers on standard output and everything else on standard error."""
+    from btfref.sampling.variant import mitsuba_variant
+
+    with os.fdopen(os.dup(1), "w") as out, mitsuba_variant("llvm_ad_rgb") as mi:
+        os.dup2(2, 1)
+        if job["task"] == "growth":
+            answers = iter([_growth(job)])
+        elif job["task"] == "reference":
+            answers = iter([Reference(mi, job).save()])
+        else:
+            answers = _answers(mi, job)
+        for answer in answers:
+            out.write(json.dumps(answer) + "\n")
+            out.flush()
+
+
+if __name__ == "__main__":
+    main(json.loads(sys.argv[1]))
