@@ -53,6 +53,18 @@ def test_workers_write_the_same_bytes(tmp_path, cluster, extra):
 
 
 @pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize("workers", [1, 4])
+def test_the_number_of_workers_changes_no_byte(tmp_path, workers):
+    """A cluster of one and one of four, started by the synthesis itself; the one of two is above."""
+    pytest.importorskip("distributed")
+    alone, shared = tmp_path / "alone.btf.zarr", tmp_path / "shared.btf.zarr"
+    settings = SETTINGS | {"estimator": "surface"}
+    synthesize_store(alone, "checker", **settings)
+    synthesize_store(shared, "checker", scheduler="dask", workers=workers, **settings)
+    assert _files(alone) == _files(shared)
+
+
+@pytest.mark.filterwarnings("default")
 def test_a_cluster_that_runs_elsewhere_is_reached_by_its_address(tmp_path, cluster):
     address = cluster.scheduler.address
     assert address.startswith("tcp://")
