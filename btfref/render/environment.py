@@ -243,13 +243,15 @@ def sunsky(*, shape=(256, 512), turbidity=3.0, sun_direction=(0.4, 0.3, 0.86), u
 CONSTRUCTED = {"constant": constant, "bright_texel": bright_texel, "sunsky": sunsky}
 
 
-def from_emitter(kind, emitter, *, file=None):
+def from_emitter(kind, emitter, types, *, file=None):
     """The environment of a Mitsuba emitter, asked of the emitter itself.
 
     Parameters
     ----------
     kind : {"envmap", "constant"}
     emitter : mitsuba.Emitter
+    types : module
+        Mitsuba's types of the emitter's variant.
     file : str, optional
         For messages.
 
@@ -261,7 +263,7 @@ def from_emitter(kind, emitter, *, file=None):
 
     values = mi.traverse(emitter)
     if kind == "constant":
-        si = mi.SurfaceInteraction3f()
+        si = types.SurfaceInteraction3f()
         return constant(np.array(emitter.eval(si), float).ravel()[:3])
     # One column of the wrap-around stands on each side of the picture.
     data = np.array(values["data"], np.float32)[:, 1:-1, :3] * np.float32(np.array(values["scale"]).item())

@@ -5,6 +5,7 @@ Both renderers start from here, so that they agree on file names, film size and 
 
 from __future__ import annotations
 
+import importlib
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,8 +102,20 @@ def use_variant(name):
         mi.set_variant(name)
 
 
+def scalar_types():
+    """Mitsuba's types of the variant ``scalar_rgb``, whatever the current one is.
+
+    To set that variant and the former one again takes 0.2 s: Mitsuba compiles its integrators in Python anew.
+    """
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        mi.set_variant("scalar_rgb")
+    return importlib.import_module("mitsuba.scalar_rgb")
+
+
 def parse(scene, parameters=None, *, variant, size=None, missing_btf=False):
-    """Parse a scene for the current variant.
+    """Parse a scene for a variant.
 
     Parameters
     ----------
@@ -111,7 +124,7 @@ def parse(scene, parameters=None, *, variant, size=None, missing_btf=False):
     parameters : dict of str to str, optional
         Values for ``$name`` in the file.
     variant : str
-        The current variant.
+        Of the objects that it is instantiated as.
     size : (int, int), optional
         Width and height of the film in place of the scene's.
     missing_btf : bool

@@ -150,39 +150,32 @@ def read_scene(scene, parameters=None, *, size=None, missing_btf=False):
     # Reading itself needs none.
     with contextlib.suppress(MissingDependencyError):
         prepare_llvm()
-    import mitsuba as mi
-
-    before = mi.variant()
-    parsing.use_variant(VARIANT)
-    try:
-        parsed = parsing.parse(scene, parameters, variant=VARIANT, size=size, missing_btf=missing_btf)
-        roots = parsed.children(parsed.state.root)
-        nodes = {
-            kind: [n for _, n in roots if parsing.is_kind(n, kind)] for kind in ("Sensor", "Emitter", "Shape")
-        }
-        _check(parsed, nodes)
-        materials = [_material(parsed, node) for node in nodes["Shape"]]
-        parsing.plain(parsed)
-        made = parsed.instantiate()
-        if not isinstance(made, mi.Scene) or len(made.shapes()) != len(nodes["Shape"]):
-            raise InputError("the file does not describe one scene of separate shapes", file=parsed.source)
-        meshes = []
-        for shape, node, (bsdf, material) in zip(made.shapes(), nodes["Shape"], materials, strict=True):
-            data = triangles_of(shape, node, file=parsed.location(node))
-            name, plugin = shape.id(), node.props.plugin_name()
-            meshes.append(MeshDescription(name=name, plugin=plugin, bsdf=bsdf, material=material, **data))
-        lights, environment = [], None
-        for node, emitter in zip(nodes["Emitter"], made.emitters(), strict=True):
-            kind = node.props.plugin_name()
-            if kind in ENVIRONMENTS:
-                environment = from_emitter(kind, emitter, file=parsed.location(node))
-            else:
-                lights.append(_light(kind, emitter))
-        camera = _camera(made.sensors()[0])
-        return SceneDescription(camera, tuple(meshes), tuple(lights), parsed.source, environment)
-    finally:
-        if before is not None:
-            parsing.use_variant(before)
+    types = parsing.scalar_types()
+    parsed = parsing.parse(scene, parameters, variant=VARIANT, size=size, missing_btf=missing_btf)
+    roots = parsed.children(parsed.state.root)
+    nodes = {
+        kind: [n for _, n in roots if parsing.is_kind(n, kind)] for kind in ("Sensor", "Emitter", "Shape")
+    }
+    _check(parsed, nodes)
+    materials = [_material(parsed, node) for node in nodes["Shape"]]
+    parsing.plain(parsed)
+    made = parsed.instantiate()
+    if not isinstance(made, types.Scene) or len(made.shapes()) != len(nodes["Shape"]):
+        raise InputError("the file does not describe one scene of separate shapes", file=parsed.source)
+    meshes = []
+    for shape, node, (bsdf, material) in zip(made.shapes(), nodes["Shape"], materials, strict=True):
+        data = triangles_of(shape, node, file=parsed.location(node))
+        name, plugin = shape.id(), node.props.plugin_name()
+        meshes.append(MeshDescription(name=name, plugin=plugin, bsdf=bsdf, material=material, **data))
+    lights, environment = [], None
+    for node, emitter in zip(nodes["Emitter"], made.emitters(), strict=True):
+        kind = node.props.plugin_name()
+        if kind in ENVIRONMENTS:
+            environment = from_emitter(kind, emitter, types, file=parsed.location(node))
+        else:
+            lights.append(_light(kind, emitter, types))
+    camera = _camera(made.sensors()[0])
+    return SceneDescription(camera, tuple(meshes), tuple(lights), parsed.source, environment)
 
 
 def _check(parsed, nodes):
@@ -287,11 +280,9 @@ def _camera(sensor):
     return Camera(to_world, float(np.radians(float(values["x_fov"]))), width, height, *clip)
 
 
-def _light(kind, emitter):
+def _light(kind, emitter, types):
     """What the emitter sends, asked of Mitsuba itself: spectra and transforms are then its own."""
-    import mitsuba as mi
-
-    point = mi.SurfaceInteraction3f()
+    point = types.SurfaceInteraction3f()
     point.p = [0.0, 0.0, 0.0]
     sample, weight = emitter.sample_direction(point, [0.5, 0.5], True)
     if kind == "directional":

@@ -39,7 +39,7 @@ def test_it_reads_pictures_as_mitsuba_does(llvm, tmp_path, rng):
     emitter = llvm.load_dict(
         {"type": "envmap", "filename": str(tmp_path / "sky.exr"), "scale": 2.0, "to_world": turn}
     )
-    environment = from_emitter("envmap", emitter)
+    environment = from_emitter("envmap", emitter, llvm)
     w = random_directions(rng, 20_000).astype(np.float32)
     si = dr.zeros(llvm.SurfaceInteraction3f, len(w))
     si.wi = -llvm.Vector3f(w.T)

@@ -226,10 +226,13 @@ def test_missing_file_unused_parameter_and_finished_object(mi, write, tmp_path):
         read_scene({"type": "scene", "c": camera(mi), "s": mi.load_dict({"type": "sphere"})})
 
 
-def test_variant_is_restored(mi):
-    mi.set_variant("scalar_rgb")
-    read_scene({"type": "scene", "c": camera(mi)})
-    assert mi.variant() == "scalar_rgb"
+def test_variant_stays(mi):
+    for variant in ("scalar_rgb", "scalar_spectral"):
+        mi.set_variant(variant)
+        sensor, light = camera(mi), {"type": "directional", "irradiance": 2.0}
+        found = read_scene({"type": "scene", "c": sensor, "l": light})
+        assert mi.variant() == variant
+        np.testing.assert_allclose(found.lights[0].power, 2)
 
 
 def test_neighbours_of_a_closed_mesh_are_mutual(mi):
