@@ -1,4 +1,4 @@
-"""Sizes of the BTFs that the factorization paper (Suykens et al. 2003) was made with, from stores of the same settings."""
+"""Sizes of the BTFs of the factorization paper (Suykens et al. 2003), from stores of the same settings."""
 
 import pytest
 
