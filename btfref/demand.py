@@ -2,8 +2,9 @@
 
 One pass over the first hits of the cameras' rays, with the delta lights that shine on them: what direct light asks of a
 BTF. Neighbours of the interpolation are counted, at directions and coordinates moved by a margin as well, since samples
-lie between those of the pass and renderers round. An environment needs all lights; light that was reflected before may
-need all views as well, and is only counted where ``indirect`` asks for it.
+lie between those of the pass and renderers round. Views, lights and their pairs have the same margin. An environment
+needs all lights; light that was reflected before may need all views as well, and is only counted where ``indirect``
+asks for it.
 """
 
 from __future__ import annotations
@@ -12,11 +13,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from btfref.conventions import texel_stencil
 from btfref.errors import InputError
-
-#: Least margin of directions, radians: renderers round.
-MARGIN = 1e-4
+from btfref.render.first_hits import MARGIN, Lookups, light_directions
 
 #: Levels of detail by which a footprint may be off.
 LEVEL_MARGIN = 0.01
@@ -32,7 +30,7 @@ class Demand:
         As the scene names it.
     views, lights : ndarray of bool, shape (n,)
     pairs : ndarray of bool, shape (n_views, n_lights)
-        Needed together, without a margin.
+        Needed together: what is traced. Maps are kept by views and by lights.
     texels : ndarray of bool, shape (rows, columns)
     least_lod : float
         Finest level of detail that a lookup has; levels below its floor are not needed.
@@ -69,7 +67,7 @@ class Demand:
         return padded.reshape(rows, side, columns, side).any((1, 3))
 
     def part(self, side=None):
-        """What to synthesize: a `btfref.sampling.part.Part` of tiles as stores have them.
+        """What to synthesize: a `btfref.sampling.part.Part` of pairs, and of tiles as stores have them.
 
         Raises
         ------
@@ -79,10 +77,10 @@ class Demand:
         from btfref.sampling.layout import TILE
         from btfref.sampling.part import Part
 
-        masks = self.views, self.lights, self.tiles(side or TILE).ravel()
-        if not all(mask.any() for mask in masks):
+        tiles = np.flatnonzero(self.tiles(side or TILE))
+        if not self.pairs.any() or not len(tiles):
             raise InputError("the scene needs nothing of this BTF", file=self.file, field="demand")
-        return Part(*(tuple(np.flatnonzero(mask).tolist()) for mask in masks))
+        return Part.of_pairs(self.pairs, tiles.tolist())
 
     def first_level(self, total):
         """Finest of ``total`` levels of detail that is needed; a little finer than found, since renderers round."""
@@ -91,12 +89,14 @@ class Demand:
     def shares(self):
         """Needed and whole numbers by what they count: views, lights, pairs, texels, samples, and further maps.
 
+        Samples are texels of pairs.
+
         Returns
         -------
         dict of str to (int, int)
         """
         found = {name: (int(getattr(self, name).sum()), getattr(self, name).size) for name in _MASKS}
-        needed, whole = (int(np.prod([found[n][i] for n in ("views", "lights", "texels")])) for i in (0, 1))
+        needed, whole = (int(np.prod([found[n][i] for n in ("pairs", "texels")])) for i in (0, 1))
         return {**found, "samples": (needed, whole), **self.maps}
 
 
@@ -119,8 +119,8 @@ def demand(
     size : (int, int), optional
         Width and height in place of the scene's.
     margin : float, optional
-        Radians by which directions may be off; default: the angle of a pixel, at least ``MARGIN``. Coordinates may be
-        off by a texel.
+        Radians by which directions may be off; default: by what they change from a sample of the pass to the second
+        next, at least the angle of a pixel and ``MARGIN``. Coordinates may be off by a texel.
     shape : (DirectionSet, DirectionSet, (int, int)), optional
         Views, lights and texels of a BTF that is not there yet; default: read from the files.
     indirect : bool
@@ -142,25 +142,29 @@ def demand(
     from btfref.render.scene import read_scene
 
     description = read_scene(scene, parameters, size=size, missing_btf=shape is not None)
-    margin = max(MARGIN, description.camera.pixel_angle) if margin is None else margin
+    least = max(MARGIN, description.camera.pixel_angle) if margin is None else margin
     wanted = {}
     for mesh in description.meshes:
         if mesh.material is not None and mesh.material.filename not in wanted:
-            wanted[mesh.material.filename] = _Collector(mesh.material.filename, shape, margin)
+            wanted[mesh.material.filename] = Lookups(mesh.material.filename, shape, least)
     from_everywhere = description.environment is not None
     offsets = grid_offsets(grid)
     with loaded(scene, parameters, size=size, plain=True) as made:
+        # Samples of the next pixel are ``grid`` samples away.
+        beside = None
+        if margin is None:
+            beside = int(made.sensors()[0].film().crop_size()[0]), min(1.0, 2 / grid)
         for number, offset in enumerate(offsets):
             ray, _ = film_rays(made.sensors()[0], offset)
             si = made.ray_intersect(ray)
-            lights = _light_directions(made, si)
+            lights = light_directions(made, si)
             for mesh, one in zip(description.meshes, made.shapes(), strict=True):
                 if mesh.material is not None:
                     footprint = description.camera.pixel_angle / grid
-                    wanted[mesh.material.filename].add(si, one, lights, mesh.material, footprint)
+                    wanted[mesh.material.filename].add(si, one, lights, mesh.material, footprint, beside)
             if progress is not None:
                 progress(number + 1, len(offsets), "first hits")
-    return {name: collector.demand(from_everywhere, indirect) for name, collector in wanted.items()}
+    return {name: Demand(name, *found.result(from_everywhere, indirect)) for name, found in wanted.items()}
 
 
 def kept_maps(scene, parameters=None, *, lights=True, **settings):
@@ -233,150 +237,3 @@ def maps_needed(demanded, representation):
             used = np.unique(array[demanded.texels])
             maps[f"entries of {name}"] = len(used), int(array.max()) + 1
     return replace(demanded, maps=maps)
-
-
-class _Collector:
-    """Gathers what lookups of one BTF touch."""
-
-    def __init__(self, file, shape, margin):
-        #: Representation whose lookups read texels elsewhere than at their coordinates.
-        self.surface = None
-        if shape is None:
-            from btfref.numerics import interpolation
-            from btfref.registry import method
-            from btfref.representations.container import load, read_maps
-
-            arrays, meta = read_maps(file, lambda name: name.startswith(("view_", "light_")))
-            self.size = tuple(meta["texels"])
-            self.tables = [interpolation.from_arrays(arrays, kind) for kind in ("view", "light")]
-            counts = [meta[f"{kind}s"]["count"] for kind in ("view", "light")]
-            if hasattr(method(meta["method"], file=file).representation, "seen_texels"):
-                self.surface = load(file)
-        else:
-            views, lights, self.size = shape
-            self.tables, counts = [views.interpolation, lights.interpolation], [len(views), len(lights)]
-        # Kept views are indices of their own: here, those of the whole count.
-        self.tables = [getattr(table, "inner", table) for table in self.tables]
-        self.file, self.margin = file, margin
-        self.views, self.lights = (np.zeros(n, bool) for n in counts)
-        self.pairs, self.texels = np.zeros(counts, bool), np.zeros(self.size, bool)
-        self.least_lod, self.lookups = np.inf, 0
-
-    def add(self, si, shape, lights, material, footprint):
-        """Count the lookups of one shape's first hits."""
-        import mitsuba as mi
-
-        seen = np.array(si.is_valid() & (si.shape == mi.ShapePtr(shape)))
-        if not seen.any():
-            return
-        w_view, side = _local(np.array(si.wi, float).T[seen], material)
-        front = w_view[:, 2] > -self.margin
-        if not front.any():
-            return
-        affine = material.to_uv
-        uv = np.array(si.uv, float).T[seen][front] @ affine[:, :2].T + affine[:, 2]
-        w_view = w_view[front]
-        self.views[self._touched(self.tables[0], w_view)] = True
-        self._touch_texels(uv, w_view)
-        if material.lod == "auto" and material.lod_bias == 0:
-            self._touch_levels(si, seen, front, material, footprint)
-        else:
-            self.least_lod = 0.0
-        view_index, view_weight = self.tables[0].stencil(_upper(w_view))
-        self.lookups += len(uv) * len(lights)
-        for light in lights:
-            w_light, _ = _local(light[seen], material, side)
-            w_light = w_light[front]
-            lit = np.isfinite(w_light).all(1) & (w_light[:, 2] > -self.margin)
-            if not lit.any():
-                continue
-            w_light = w_light[lit]
-            self.lights[self._touched(self.tables[1], w_light)] = True
-            index, weight = self.tables[1].stencil(_upper(w_light), hold=False)
-            both = (view_weight[lit][:, :, None] > 0) & (weight[:, None, :] > 0)
-            flat = (view_index[lit][:, :, None] * len(self.lights) + index[:, None, :])[both]
-            self.pairs.reshape(-1)[np.unique(flat)] = True
-
-    def _touched(self, table, w):
-        """Samples with weight at the directions or within the margin of them."""
-        m = self.margin
-        shifts = m * np.array(
-            [[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]
-        )
-        found = []
-        for shift in shifts:
-            index, weight = table.stencil(_upper(w + shift))
-            found.append(np.unique(index[weight > 0]))
-        return np.unique(np.concatenate(found))
-
-    def _touch_texels(self, uv, w_view):
-        there = np.zeros(self.size, bool)
-        if self.surface is None:
-            index, _ = texel_stencil(uv, self.size, "bilinear")
-            there.reshape(-1)[np.unique(index)] = True
-        else:
-            # A ray that is a little off may pass a silhouette and see another place.
-            for shift in MARGIN * np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]):
-                index = self.surface.seen_texels(uv, _upper(w_view + shift))
-                there.reshape(-1)[np.unique(index)] = True
-        for rows in (-1, 0, 1):
-            for columns in (-1, 0, 1):
-                self.texels |= np.roll(there, (rows, columns), (0, 1))
-
-    def _touch_levels(self, si, seen, front, material, footprint):
-        from btfref.numerics.footprint import cone_footprint
-
-        du, dv, n = (np.array(a, float).T[seen][front] for a in (si.dp_du, si.dp_dv, si.n))
-        distance = np.array(si.t, float)[seen][front]
-        # Rows of the inverse of (dp_du, dp_dv) in the tangent plane are the gradients of u and v.
-        gram = np.stack([(du * du).sum(-1), (du * dv).sum(-1), (dv * dv).sum(-1)], -1)
-        determinant = gram[:, 0] * gram[:, 2] - gram[:, 1] ** 2
-        scale = 1 / np.where(determinant > 0, determinant, 1)[:, None]
-        gradients = [
-            (gram[:, 2:3] * du - gram[:, 1:2] * dv) * scale,
-            (gram[:, 0:1] * dv - gram[:, 1:2] * du) * scale,
-        ]
-        a = material.to_uv
-        rows, columns = self.size
-        u = columns * (a[0, 0] * gradients[0] + a[0, 1] * gradients[1])
-        v = rows * (a[1, 0] * gradients[0] + a[1, 1] * gradients[1])
-        towards = np.array(si.to_world(si.wi), float).T[seen][front]
-        lod, _, _ = cone_footprint(u, v, towards, n, footprint * distance)
-        self.least_lod = min(self.least_lod, float(lod.min()))
-
-    def demand(self, from_everywhere, indirect):
-        """What was found; all lights where they come from everywhere, and all views where light is reflected on."""
-        if self.views.any() and (from_everywhere or indirect):
-            self.views |= indirect
-            self.lights[:] = True
-            self.pairs |= self.views[:, None]
-        least = 0.0 if indirect or not np.isfinite(self.least_lod) else self.least_lod
-        return Demand(self.file, self.views, self.lights, self.pairs, self.texels, least, self.lookups)
-
-
-def _light_directions(scene, si):
-    """Local directions towards every delta light, each of shape (n, 3), float64."""
-    import mitsuba as mi
-
-    result = []
-    for emitter in scene.emitters():
-        sample, _ = emitter.sample_direction(si, mi.Point2f(0.5))
-        result.append(np.array(si.to_local(sample.d), float).T)
-    return result
-
-
-def _local(w, material, side=None):
-    """Directions in the texture's frame, and the side of the surface on which the first ones lie."""
-    c, s = material.rotation
-    w = np.stack([c * w[:, 0] - s * w[:, 1], s * w[:, 0] + c * w[:, 1], w[:, 2]], 1)
-    if side is None:
-        side = np.where(w[:, 2] < 0, -1.0, 1.0) if material.twosided else np.ones(len(w))
-    w[:, 2] *= side
-    return w, side
-
-
-def _upper(w):
-    """Unit vectors above the horizon nearest to ``w``."""
-    w = np.array(w)
-    w[:, 2] = np.maximum(w[:, 2], 1e-6)
-    return w / np.linalg.norm(w, axis=1, keepdims=True)

@@ -10,6 +10,8 @@ traces what is needed alone.
 
 from __future__ import annotations
 
+import numpy as np
+
 from btfref.commands._shared import (
     Progress,
     assignments,
@@ -53,7 +55,7 @@ def add_scene_arguments(parser):
         "--margin",
         type=number_above(0),
         metavar="RADIANS",
-        help="by which directions may be off (default: the angle of a pixel)",
+        help="by which directions may be off (default: by what they change between samples)",
     )
     parser.add_argument(
         "--indirect", action="store_true", help="count what light may need that was reflected more than once"
@@ -78,6 +80,7 @@ def run(args):
                 name: {
                     "shares": {what: {"needed": n, "of": m} for what, (n, m) in one.shares().items()},
                     **{what: getattr(one, what).nonzero()[0].tolist() for what in ("views", "lights")},
+                    "pairs": np.argwhere(one.pairs).tolist(),
                     "least_lod": one.least_lod,
                     "lookups": one.lookups,
                 }

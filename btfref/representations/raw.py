@@ -37,9 +37,13 @@ class Representation(StoredMaps):
         def kernel(s):
             index = (s.texel[:, :, None, None], s.view[:, None, :, None], s.light[:, None, None, :])
             found = real(table[index])
+            if partial:
+                # Neighbours without weight may not be there.
+                weight = s.texel_weight[:, :, None, None] * s.view_weight[:, None, :, None]
+                found = np.where((weight * s.light_weight[:, None, None, :])[..., None] > 0, found, 0)
             result = np.einsum("nt,nv,nl,ntvlc->nc", s.texel_weight, s.view_weight, s.light_weight, found)
             if partial and np.isnan(result).any():
-                raise InputError("a lookup needs texels that are not resident", field="texels")
+                raise InputError("a lookup needs texels or pairs that are not resident", field="texels")
             return result
 
         return evaluate_tabulated(self, kernel, uv, w_light, w_view)

@@ -86,13 +86,16 @@ def _regions(store):
 
 
 def _fill_by_texels(job, store, views, only, plan, size):
-    _, lights, tiles = only.indices(store)
+    *_, tiles = only.indices(store)
+    pairs = only.wanted(store)
     wanted = np.zeros(store.coverage_shape, bool)
     wanted[tiles] = True
-    estimator = job.make_estimator(views, lights=lights, buffer=size.buffer)
+    estimator = job.make_estimator(views, buffer=size.buffer)
     columns = store.texels[1]
     for view in views:
-        missing = wanted & ~store.covered(view)[lights].all(0)
+        absent = pairs[view][:, None, None] & wanted & ~store.covered(view)
+        lights, missing = np.flatnonzero(absent.any((1, 2))), absent.any(0)
+        estimator.choose(lights)
         counts = None
         if plan is not None:
             counts = plan.counts(store.maps("pilot")[view])
@@ -145,14 +148,20 @@ def _pilot_by_texels(job, store, views, only, plan, size):
 
 
 def _fill_by_views(job, store, views, only, plan, size):
-    _, lights, tiles = only.indices(store)
+    *_, tiles = only.indices(store)
+    pairs = only.wanted(store)
     mask = None if len(tiles[0]) == np.prod(store.coverage_shape) else only.mask(store)
     for group in _groups(views, size.views):
+        lights = np.flatnonzero(pairs[group].any(0))
         for chosen in _groups(lights, size.lights):
-            chosen = np.asarray(chosen)
             estimator = job.make_estimator(group, lights=chosen, mask=mask)
             for view, mean, variance in estimator.all_views(group):
-                store.write_part(view, chosen, tiles, mean, variance if store.has_variance else None)
+                mine = pairs[view, chosen]
+                parts = (mean, variance if store.has_variance else None)
+                if not mine.all():
+                    parts = (None if part is None else part[mine] for part in parts)
+                if mine.any():
+                    store.write_part(view, chosen[mine], tiles, *parts)
                 if len(chosen) == len(lights):
                     yield view
             del estimator

@@ -139,6 +139,7 @@ class Job:
         wanted : sequence of int
             Views.
         lights : ndarray of int, optional
+            That the surface estimator makes; all when not given. That of paths is told from view to view.
         mask : ndarray (rows · columns,) bool, optional
             Texels that are wanted.
         spp : int, optional
@@ -155,7 +156,7 @@ class Job:
             seed = int(np.random.SeedSequence([seed, *stream]).generate_state(1, np.uint64)[0] >> 2)
         return make(
             self.mesostructure,
-            self.lights.vectors if lights is None else self.lights.vectors[lights],
+            self.lights.vectors,
             views=self.views.vectors,
             wanted=[int(view) for view in wanted],
             mask=mask,
@@ -165,7 +166,7 @@ class Job:
             max_depth=self.max_depth,
             **({} if buffer is None else {"buffer": buffer}),
             # Paths make theirs in passing; they are not kept.
-            **({"variance": self.variance} if self.estimator == "surface" else {}),
+            **({"variance": self.variance, "chosen": lights} if self.estimator == "surface" else {}),
         )
 
     def unfinished(self, store, views, stage, only=None):
@@ -173,8 +174,10 @@ class Job:
         if stage == "pilot":
             pilots = store.maps("pilot")
             return [int(view) for view in views if not np.isfinite(pilots[view, 0, 0, 0])]
-        _, lights, tiles = (only or Part()).indices(store)
-        return [int(view) for view in views if not store.covered(view)[lights][:, tiles[0], tiles[1]].all()]
+        only = only or Part()
+        wanted, (*_, tiles) = only.wanted(store), only.indices(store)
+        covered = store.coverage[:, :, tiles[0], tiles[1]].all(-1)
+        return [int(view) for view in views if (wanted[view] & ~covered[view]).any()]
 
     def to_store(self, out, *, overwrite=False, progress=None, only=None, report=None, **means):
         """Fill the store at ``out``, from where an earlier run of the same settings stopped."""
@@ -195,10 +198,10 @@ class Job:
                 adaptive=self.target_error is not None,
             )
         only = only or Part()
-        views, lights, _ = only.indices(store)
+        views, *_ = only.indices(store)
         peak, plan = 0, None
         if self.target_error is not None:
-            if len(lights) < len(self.lights):
+            if not only.wanted(store)[views].all():
                 # Samples are placed for the mean over all lights, which share them.
                 raise InputError("with a target error all lights are made together", field="lights")
             every = range(len(self.views))

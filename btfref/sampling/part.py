@@ -1,4 +1,4 @@
-"""A part of a sampled BTF: some views, some lights, some tiles."""
+"""A part of a sampled BTF: some pairs of views and lights, some tiles."""
 
 from __future__ import annotations
 
@@ -19,31 +19,82 @@ class Part:
         Indices; None for all.
     tiles : sequence of int, or None
         Numbers of tiles of texels, row by row; None for all.
+    pairs : sequence of (int, sequence of int), or None
+        In place of views and lights: views, each once, with the lights that are wanted of them, at least one.
     """
 
     views: tuple | None = None
     lights: tuple | None = None
     tiles: tuple | None = None
+    pairs: tuple | None = None
+
+    @classmethod
+    def of_pairs(cls, pairs, tiles=None):
+        """The part of some pairs; plain views and lights where these are all their pairs.
+
+        Parameters
+        ----------
+        pairs : ndarray of bool, shape (n_views, n_lights)
+            At least one.
+        tiles : sequence of int, optional
+
+        Returns
+        -------
+        Part
+        """
+        views, lights = (tuple(np.flatnonzero(pairs.any(axis)).tolist()) for axis in (1, 0))
+        tiles = None if tiles is None else tuple(tiles)
+        if pairs.sum() == len(views) * len(lights):
+            return cls(views, lights, tiles)
+        return cls(tiles=tiles, pairs=tuple((v, tuple(np.flatnonzero(pairs[v]).tolist())) for v in views))
 
     def indices(self, store):
-        """Indices of views and lights, and (rows, columns) of the tiles.
+        """What it spans.
+
+        Returns
+        -------
+        views : ndarray of int
+        lights : ndarray of int
+            That any of the views wants.
+        tiles : (ndarray, ndarray) of int
+            Rows and columns.
 
         Raises
         ------
         InputError
             An index out of range.
         """
-        rows, columns = store.coverage.shape[2:]
-        views = _checked("views", self.views, len(store.views))
-        lights = _checked("lights", self.lights, len(store.lights))
-        tiles = _checked("tiles", self.tiles, rows * columns)
-        return views, lights, (tiles // columns, tiles % columns)
+        wanted = self.wanted(store)
+        columns = store.coverage_shape[1]
+        tiles = _checked("tiles", self.tiles, int(np.prod(store.coverage_shape)))
+        return (
+            np.flatnonzero(wanted.any(1)),
+            np.flatnonzero(wanted.any(0)),
+            (tiles // columns, tiles % columns),
+        )
+
+    def wanted(self, store):
+        """Pairs that belong to it: (views, lights) bool; errors as of `indices`."""
+        n_views, n_lights = len(store.views), len(store.lights)
+        result = np.zeros((n_views, n_lights), bool)
+        if self.pairs is None:
+            views, lights = _checked("views", self.views, n_views), _checked("lights", self.lights, n_lights)
+            result[np.ix_(views, lights)] = True
+            return result
+        if self.views is not None or self.lights is not None:
+            raise InputError("part of a BTF", field="pairs", got="views or lights beside", expected="either")
+        views = [view for view, _ in self.pairs]
+        if len(_checked("pairs", views, n_views)) < len(views):
+            raise InputError("part of a BTF", field="pairs", got=views, expected="each view once")
+        for view, lights in self.pairs:
+            result[view, _checked("pairs", lights, n_lights)] = True
+        return result
 
     def mask(self, store):
         """Texels of the part's tiles: (rows · columns,) bool."""
         rows, columns = store.texels
         _, _, tiles = self.indices(store)
-        wanted = np.zeros(store.coverage.shape[2:], bool)
+        wanted = np.zeros(store.coverage_shape, bool)
         wanted[tiles] = True
         row, column = np.arange(rows) // store.tile[0], np.arange(columns) // store.tile[1]
         return wanted[np.ix_(row, column)].ravel()

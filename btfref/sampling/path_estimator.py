@@ -81,18 +81,29 @@ class PathEstimator:
     def __init__(
         self, mesostructure, lights, *, texels, spp, seed, max_depth, views=None, wanted=None, mask=None
     ):
+        self.texels, self.spp, self.seed = tuple(texels), int(spp), int(seed)
+        self.max_depth, self.views, self.mask = int(max_depth), views, mask
+        self._vectors = np.asarray(lights, dtype=np.float64)
+        self.tiles = TiledScene(mesostructure, self._vectors)
+        self._buffer = None
+        self.choose()
+
+    def choose(self, lights=None):
+        """Make results of some lights from now on; those of a light do not depend on which others are made.
+
+        Parameters
+        ----------
+        lights : ndarray of int, optional
+            Indices; all when not given.
+        """
         import drjit as dr
         import mitsuba as mi
 
-        self.texels, self.spp, self.seed = tuple(texels), int(spp), int(seed)
-        self.max_depth, self.views, self.mask = int(max_depth), views, mask
-        lights = np.asarray(lights, dtype=np.float64)
-        self.lit = np.flatnonzero(lights[:, 2] > 0)
-        self.n_lights = len(lights)
-        self.tiles = TiledScene(mesostructure, lights)
-        self.lights = mi.Float(lights[self.lit].astype(np.float32).ravel())
+        vectors = self._vectors if lights is None else self._vectors[lights]
+        self.n_lights = len(vectors)
+        self.lit = np.flatnonzero(vectors[:, 2] > 0)
+        self.lights = mi.Float(vectors[self.lit].astype(np.float32).ravel())
         dr.eval(self.lights)
-        self._buffer = None
 
     @property
     def texels_per_pass(self):
@@ -148,8 +159,8 @@ class PathEstimator:
 
         n_lit = len(self.lit)
         if self._buffer is None or dr.width(self._buffer) != 3 * n_lit * n_lanes:
-            # Touching new memory costs as much as filling it: one buffer serves all views.
-            self._buffer = dr.zeros(mi.Float, 3 * n_lit * n_lanes)
+            # Touching new memory costs as much as filling it: one buffer serves all views of equally many lights.
+            self._buffer = dr.empty(mi.Float, 3 * n_lit * n_lanes)
         # Everything that changes between views is opaque: one kernel then serves all of them.
         first = dr.opaque(mi.UInt32, first)
         n_lanes_opaque = dr.opaque(mi.UInt32, n_lanes)

@@ -195,6 +195,7 @@ class BTFStore:
             "coverage_of": {
                 "views": int(covered.any(axis=(1, 2, 3)).sum()),
                 "lights": int(covered.any(axis=(0, 2, 3)).sum()),
+                "pairs": f"{int(covered.any(axis=(2, 3)).sum())} of {covered[:, :, 0, 0].size}",
                 "tiles": f"{int(covered.any(axis=(0, 1)).sum())} of {covered[0, 0].size}",
             },
             "complete": bool(covered.all()),
@@ -297,12 +298,14 @@ class BTFStore:
             slice(k * s * t, min((k + 1) * s * t, n))
             for k, s, t, n in zip(shard, self.shard, self.tile, self.texels, strict=True)
         )
-        place = (view, slice(None), rows, columns)
+        # Few lights of many: what lies before the first and behind the last one is not touched.
+        span = slice(int(lights.min()), int(lights.max()) + 1)
+        place = (view, span, rows, columns)
         within = np.array([rows.start, columns.start])
         n_tiles = [
             -(-(part.stop - part.start) // t) for part, t in zip((rows, columns), self.tile, strict=True)
         ]
-        whole = len(lights) == len(self.lights) and len(tiles) == n_tiles[0] * n_tiles[1]
+        whole = len(lights) == span.stop - span.start and len(tiles) == n_tiles[0] * n_tiles[1]
 
         def given(texel_rows, texel_columns):
             part = array[
@@ -329,7 +332,7 @@ class BTFStore:
                     slice(part.start - first, part.stop - first)
                     for part, first in zip(texels, within, strict=True)
                 ]
-                block[lights, there[0], there[1]] = given(*texels)
+                block[lights - span.start, there[0], there[1]] = given(*texels)
         self._guard(field, lambda: target.__setitem__(place, block))
 
     def read(self, *, views=None, lights=None, rows=None, columns=None, variance=True):

@@ -114,6 +114,8 @@ class SurfaceEstimator:
         Views that will be asked for; None for all.
     mask : ndarray (rows · columns,) bool, optional
         Texels that are asked for; None for all. The others lack light by way of broad lobes.
+    chosen : sequence of int, optional
+        Lights that results are of; None for all.
     variance : bool
         Whether variances are made; they take about a third of the time of `all_views`.
 
@@ -126,7 +128,7 @@ class SurfaceEstimator:
 
     def __init__(
         self, mesostructure, lights, *, views, texels, spp, seed, max_depth, wanted=None, mask=None,
-        variance=True,
+        chosen=None, variance=True,
     ):  # fmt: skip
         import mitsuba as mi
 
@@ -135,6 +137,9 @@ class SurfaceEstimator:
         self.n_texels = texels[0] * texels[1]
         views, lights = np.asarray(views, np.float64), np.asarray(lights, np.float64)
         wanted = np.arange(len(views)) if wanted is None else np.asarray(wanted)
+        # The patch is that of all directions: rays that are wrapped elsewhere round otherwise.
+        ways = np.concatenate([views, lights])
+        lights = lights if chosen is None else lights[np.asarray(chosen)]
         self.n_lights = len(lights)
         self.lit = np.flatnonzero(lights[:, 2] > 0)
         self.wanted = wanted[views[wanted, 2] > 0]
@@ -149,7 +154,7 @@ class SurfaceEstimator:
         self.broad_walks, self.rest_walks = walks(self.spp)
         if not len(directions) or not len(self.lit):
             return
-        tiles = TiledScene(mesostructure, np.concatenate([views, lights]))
+        tiles = TiledScene(mesostructure, ways)
         lights = Lights(to_device(mi.Float, lights[self.lit]), to_device(mi.UInt32, light_rows))
         self.scene = SurfaceScene(tiles, BroadLobes(tiles.bsdfs), directions, lights)
         self._place_points(mesostructure, views)

@@ -111,7 +111,7 @@ def test_parts_add_up_to_the_same_store(tmp_path, estimator):
     out = tmp_path / "parts.btf.zarr"
     store = synthesize_store(out, "checker", only=Part(views=(1, 4)), **settings)
     assert store.coverage.any(axis=(1, 2, 3)).tolist() == [False, True, False, False, True, False]
-    assert store.info()["coverage_of"] == {"views": 2, "lights": 8, "tiles": "1 of 1"}
+    assert store.info()["coverage_of"] == {"views": 2, "lights": 8, "pairs": "16 of 48", "tiles": "1 of 1"}
     store = synthesize_store(out, "checker", only=Part(lights=(0, 5)), **settings)
     assert store.coverage.mean() == pytest.approx((2 * 8 + 4 * 2) / 48)
     with pytest.raises(InputError, match="incomplete"):

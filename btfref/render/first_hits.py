@@ -1,0 +1,238 @@
+"""The first hits of a camera's rays as lookups of a BTF: which samples, texels and levels of detail they read."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from btfref.conventions import texel_stencil
+
+#: Least margin of directions, radians: renderers round.
+MARGIN = 1e-4
+
+#: Most that directions of neighbouring pixels say of the margin, radians: a step of more is an edge.
+LARGEST_CHANGE = 0.25
+
+#: Where a direction may be instead, in margins.
+_SHIFTS = np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+
+
+class Lookups:
+    """Gathers what lookups of one BTF touch.
+
+    Parameters
+    ----------
+    file : path-like
+        Of the representation.
+    shape : (DirectionSet, DirectionSet, (int, int)) or None
+        Views, lights and texels of a BTF that is not there yet.
+    margin : float
+        Radians by which directions may be off at least.
+    """
+
+    def __init__(self, file, shape, margin):
+        #: Representation whose lookups read texels elsewhere than at their coordinates.
+        self.surface = None
+        if shape is None:
+            from btfref.numerics import interpolation
+            from btfref.registry import method
+            from btfref.representations.container import load, read_maps
+
+            arrays, meta = read_maps(file, lambda name: name.startswith(("view_", "light_")))
+            self.size = tuple(meta["texels"])
+            self.tables = [interpolation.from_arrays(arrays, kind) for kind in ("view", "light")]
+            counts = [meta[f"{kind}s"]["count"] for kind in ("view", "light")]
+            if hasattr(method(meta["method"], file=file).representation, "seen_texels"):
+                self.surface = load(file)
+        else:
+            views, lights, self.size = shape
+            self.tables, counts = [views.interpolation, lights.interpolation], [len(views), len(lights)]
+        # Kept views are indices of their own: here, those of the whole count.
+        self.tables = [getattr(table, "inner", table) for table in self.tables]
+        self.file, self.margin = file, margin
+        self.views, self.lights = (np.zeros(n, bool) for n in counts)
+        self.pairs, self.texels = np.zeros(counts, bool), np.zeros(self.size, bool)
+        self.least_lod, self.lookups = np.inf, 0
+
+    def add(self, si, shape, lights, material, footprint, beside=None):
+        """Count the lookups of one shape's first hits.
+
+        ``beside``: width of the picture, and share of the changes from pixel to pixel that is margin.
+        """
+        import mitsuba as mi
+
+        seen = np.array(si.is_valid() & (si.shape == mi.ShapePtr(shape)))
+        if not seen.any():
+            return
+        towards = np.array(si.wi, float).T
+        w_view, side = _local(towards[seen], material)
+        front = w_view[:, 2] > -self.margin
+        if not front.any():
+            return
+        affine = material.to_uv
+        uv = np.array(si.uv, float).T[seen][front] @ affine[:, :2].T + affine[:, 2]
+        w_view = w_view[front]
+        view_sets = self._touched(self.tables[0], w_view, self._margins(towards, seen, beside)[front])
+        self.views[view_sets.all_touched()] = True
+        self._touch_texels(uv, w_view)
+        if material.lod == "auto" and material.lod_bias == 0:
+            self._touch_levels(si, seen, front, material, footprint)
+        else:
+            self.least_lod = 0.0
+        self.lookups += len(uv) * len(lights)
+        for light in lights:
+            w_light, _ = _local(light[seen], material, side)
+            w_light, margin = w_light[front], self._margins(light, seen, beside)[front]
+            lit = np.isfinite(w_light).all(1) & (w_light[:, 2] > -margin)
+            if not lit.any():
+                continue
+            light_sets = self._touched(self.tables[1], w_light[lit], margin[lit])
+            self.lights[light_sets.all_touched()] = True
+            _mark_pairs(self.pairs, view_sets, light_sets, lit)
+
+    def _margins(self, w, seen, beside):
+        """By what directions of the seen lookups may be off: by what they change to those of neighbouring pixels."""
+        if beside is None:
+            return np.full(int(seen.sum()), self.margin)
+        width, share = beside
+        w, seen = w.reshape(-1, width, 3), seen.reshape(-1, width)
+        change = np.full(seen.shape, self.margin)
+        for axis in (0, 1):
+            first, second = (np.moveaxis(change, axis, 0)[part] for part in (slice(-1), slice(1, None)))
+            with np.errstate(invalid="ignore", over="ignore"):
+                step = np.moveaxis(np.linalg.norm(np.diff(w, axis=axis), axis=-1), axis, 0)
+            both = np.moveaxis(seen, axis, 0)
+            # Behind a silhouette there is another surface, or none: neighbours inside tell how fast this one turns.
+            inside = both[:-1] & both[1:] & np.isfinite(step)
+            step = np.where(inside, share * np.minimum(step, LARGEST_CHANGE), 0)
+            np.maximum(first, step, out=first)
+            np.maximum(second, step, out=second)
+        return change[seen]
+
+    def _touched(self, table, w, margin):
+        """Sets of the samples with weight at each direction or within the margin of it."""
+        index, weight = [], []
+        for shift in _SHIFTS:
+            some = table.stencil(_upper(w + margin[:, None] * shift))
+            index.append(some[0])
+            weight.append(some[1])
+        return _Sets.of_rows(np.where(np.concatenate(weight, 1) > 0, np.concatenate(index, 1), -1))
+
+    def _touch_texels(self, uv, w_view):
+        there = np.zeros(self.size, bool)
+        if self.surface is None:
+            index, _ = texel_stencil(uv, self.size, "bilinear")
+            there.reshape(-1)[np.unique(index)] = True
+        else:
+            # A ray that is a little off may pass a silhouette and see another place.
+            for shift in MARGIN * np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]):
+                index = self.surface.seen_texels(uv, _upper(w_view + shift))
+                there.reshape(-1)[np.unique(index)] = True
+        for rows in (-1, 0, 1):
+            for columns in (-1, 0, 1):
+                self.texels |= np.roll(there, (rows, columns), (0, 1))
+
+    def _touch_levels(self, si, seen, front, material, footprint):
+        from btfref.numerics.footprint import cone_footprint
+
+        du, dv, n = (np.array(a, float).T[seen][front] for a in (si.dp_du, si.dp_dv, si.n))
+        distance = np.array(si.t, float)[seen][front]
+        # Rows of the inverse of (dp_du, dp_dv) in the tangent plane are the gradients of u and v.
+        gram = np.stack([(du * du).sum(-1), (du * dv).sum(-1), (dv * dv).sum(-1)], -1)
+        determinant = gram[:, 0] * gram[:, 2] - gram[:, 1] ** 2
+        scale = 1 / np.where(determinant > 0, determinant, 1)[:, None]
+        gradients = [
+            (gram[:, 2:3] * du - gram[:, 1:2] * dv) * scale,
+            (gram[:, 0:1] * dv - gram[:, 1:2] * du) * scale,
+        ]
+        a = material.to_uv
+        rows, columns = self.size
+        u = columns * (a[0, 0] * gradients[0] + a[0, 1] * gradients[1])
+        v = rows * (a[1, 0] * gradients[0] + a[1, 1] * gradients[1])
+        towards = np.array(si.to_world(si.wi), float).T[seen][front]
+        lod, _, _ = cone_footprint(u, v, towards, n, footprint * distance)
+        self.least_lod = min(self.least_lod, float(lod.min()))
+
+    def result(self, from_everywhere, indirect):
+        """Views, lights, pairs, texels, finest level and number of lookups, as of :class:`btfref.demand.Demand`.
+
+        All lights where they come from everywhere, and all views where light is reflected on.
+        """
+        if self.views.any() and (from_everywhere or indirect):
+            self.views |= indirect
+            self.lights[:] = True
+            self.pairs |= self.views[:, None]
+        least = 0.0 if indirect or not np.isfinite(self.least_lod) else self.least_lod
+        return self.views, self.lights, self.pairs, self.texels, least, self.lookups
+
+
+class _Sets:
+    """Sets of samples, one for each lookup; few of them differ.
+
+    Attributes
+    ----------
+    rows : ndarray of int, shape (n_sets, k)
+        Members of each set; −1 stands for nothing.
+    which : ndarray of int, shape (n_lookups,)
+        Set of each lookup.
+    """
+
+    def __init__(self, rows, which):
+        self.rows, self.which = rows, which
+
+    @classmethod
+    def of_rows(cls, rows):
+        """From the members of each lookup's set; equal sets in another order count as another set."""
+        # Sorting the rows themselves would take ten times as long as sorting one number of each.
+        factors = np.random.default_rng(0).integers(1, 2**63, rows.shape[1], np.uint64)
+        _, first, which = np.unique(rows.astype(np.uint64) @ factors, return_index=True, return_inverse=True)
+        if not np.array_equal(rows[first][which], rows):
+            _, first, which = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+        return cls(rows[first], which.ravel())
+
+    def all_touched(self):
+        """Members of any set."""
+        return np.unique(self.rows[self.rows >= 0])
+
+
+def _mark_pairs(pairs, views, lights, lit):
+    """Mark all pairs of a lookup's views and lights; ``lights`` has the lookups of ``lit`` alone."""
+    n_sets = len(lights.rows)
+    both = np.unique(views.which[lit].astype(np.int64) * n_sets + lights.which)
+    for first in range(0, len(both), 4096):
+        view, light = (
+            sets[some]
+            for sets, some in zip(
+                (views.rows, lights.rows), np.divmod(both[first : first + 4096], n_sets), strict=True
+            )
+        )
+        inside = (view >= 0)[:, :, None] & (light >= 0)[:, None, :]
+        flat = view[:, :, None] * pairs.shape[1] + light[:, None, :]
+        pairs.reshape(-1)[flat[inside]] = True
+
+
+def light_directions(scene, si):
+    """Local directions towards every delta light, each of shape (n, 3), float64."""
+    import mitsuba as mi
+
+    result = []
+    for emitter in scene.emitters():
+        sample, _ = emitter.sample_direction(si, mi.Point2f(0.5))
+        result.append(np.array(si.to_local(sample.d), float).T)
+    return result
+
+
+def _local(w, material, side=None):
+    """Directions in the texture's frame, and the side of the surface on which the first ones lie."""
+    c, s = material.rotation
+    w = np.stack([c * w[:, 0] - s * w[:, 1], s * w[:, 0] + c * w[:, 1], w[:, 2]], 1)
+    if side is None:
+        side = np.where(w[:, 2] < 0, -1.0, 1.0) if material.twosided else np.ones(len(w))
+    w[:, 2] *= side
+    return w, side
+
+
+def _upper(w):
+    """Unit vectors above the horizon nearest to ``w``."""
+    w = np.array(w)
+    w[:, 2] = np.maximum(w[:, 2], 1e-6)
+    return w / np.linalg.norm(w, axis=1, keepdims=True)
