@@ -367,9 +367,8 @@ def tile_equivalence(difference, variance, mask, *, tolerance, significance=0.01
     mean, spread = tile_means(difference, variance, mask, size=size, least=size * size // 4)
     if not mean.size:
         return None
+    half = tile_half_widths(variance, mask, significance=significance, size=size)
     confidence = 1 - sidak(significance, mean.size)
-    # A normal interval's half width is the same multiple of the standard error for all.
-    half = interval(0.0, 1.0, confidence=confidence).high * np.sqrt(spread)
     if (np.abs(mean) - half > tolerance).any():
         outcome = "fail"
     else:
@@ -377,6 +376,26 @@ def tile_equivalence(difference, variance, mask, *, tolerance, significance=0.01
     worst = np.unravel_index(np.abs(mean).argmax(), mean.shape)
     worst = interval(mean[worst], np.sqrt(spread[worst]), confidence=confidence)
     return Equivalence(outcome, worst, float(tolerance))
+
+
+def tile_half_widths(variance, mask, *, significance=0.01, size=8):
+    """Half widths of the intervals of `tile_equivalence`.
+
+    Parameters
+    ----------
+    variance, mask, significance, size
+        As there.
+
+    Returns
+    -------
+    (n, C) float64 array
+        Tiles of which a quarter counts.
+    """
+    _, spread = tile_means(variance, variance, mask, size=size, least=size * size // 4)
+    if not spread.size:
+        return spread
+    # A normal interval's half width is the same multiple of the standard error for all.
+    return interval(0.0, 1.0, confidence=1 - sidak(significance, spread.size)).high * np.sqrt(spread)
 
 
 def _with_variance(difference, variance):

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from btfref.compare.tolerances import tolerance
+from btfref.compare import significance
+from btfref.compare.tolerances import gate_table, tolerance
 from btfref.render.camera import tell_camera
 from btfref.render.loading import loaded
 from btfref.render.reference import BATCHES, traced
@@ -38,8 +39,8 @@ def converged(
     scene : path-like or dict
     mask : ndarray of bool, shape (H, W)
         Pixels that the gate looks at.
-    gate : str
-        Key of ``tolerances.toml`` with ``relative_rmse``.
+    gate : str or sequence of str
+        Keys of ``tolerances.toml``; their ``relative_rmse`` and ``relative_tile_bias`` count.
     parameters : dict of str to str, optional
     size : (int, int), optional
     seed : int
@@ -53,10 +54,11 @@ def converged(
     Returns
     -------
     RenderResult
-        ``meta["noise"]``, the root mean variance over the mask relative to the mean radiance; ``meta["noise_limit"]``,
-        a quarter of the gate's tolerance; ``meta["spp"]``. With ``grid`` four independent ``pictures``.
+        ``meta["noise"]``, the root mean variance over the mask relative to the mean radiance; ``meta["noise_ratio"]``,
+        the largest noise over what a gate admits: a quarter of its ``relative_rmse``, and for tiles an interval whose
+        half width is half of the ``relative_tile_bias``; ``meta["spp"]``. With ``grid`` four independent ``pictures``.
     """
-    limit = tolerance("reference.standard_error.max_fraction") * tolerance(f"{gate}.relative_rmse")
+    limits = [gate_table(key) for key in ([gate] if isinstance(gate, str) else gate)]
     seeds = np.random.SeedSequence(seed).generate_state(32)
     mean = squared = total = 0.0
     done, count = 0, FIRST
@@ -77,14 +79,15 @@ def converged(
             image = mean.mean(0)
             scale = float(np.abs(image[mask]).mean()) if mask.any() else 0.0
             noise = float(np.sqrt(squared[mask].mean())) / scale if scale > 0 else 0.0
+            ratio = _ratio(noise, squared / scale**2, mask, limits) if scale > 0 else 0.0
             if progress:
-                progress(min(done, most), most, f"reference, noise {noise:.2g} of {limit:.2g}")
-            if noise <= limit or done >= most:
+                progress(min(done, most), most, f"reference, {ratio:.2g} of the noise that is allowed")
+            if ratio <= 1 or done >= most:
                 break
             # As many as the noise asks for, a tenth more because it is itself an estimate.
-            wanted = 1.1 * done * (noise / limit) ** (RATE if grid else 2)
+            wanted = 1.1 * done * ratio ** (RATE if grid else 2)
             count = int(np.clip(wanted, BATCHES, max(BATCHES, min(most - done, 16 * done))))
-    meta = {**found.meta, "spp": done, "noise": noise, "noise_limit": limit}
+    meta = {**found.meta, "spp": done, "noise": noise, "noise_ratio": ratio}
     return replace(
         found,
         image=image.astype(np.float32),
@@ -92,3 +95,16 @@ def converged(
         meta=meta,
         pictures=mean.astype(np.float32) if grid else None,
     )
+
+
+def _ratio(noise, variance, mask, limits):
+    """The largest noise over what one of the gates admits; ``variance`` is relative."""
+    pixel, tile = (
+        tolerance(f"reference.{name}.max_fraction") for name in ("standard_error", "tile_half_width")
+    )
+    found = [noise / (pixel * entry["relative_rmse"]) for entry in limits if "relative_rmse" in entry]
+    for entry in limits:
+        if "relative_tile_bias" in entry:
+            half = significance.tile_half_widths(variance, mask, significance=entry["significance"])
+            found.append(half.max(initial=0.0) / (tile * entry["relative_tile_bias"]))
+    return float(max(found))

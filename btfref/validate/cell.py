@@ -39,7 +39,7 @@ ENVIRONMENT_GATES = {
 COUNTED = (1, 3)
 
 #: Samples per pixel of a reference under an environment at most.
-MOST = 1 << 13
+MOST = 1 << 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +222,7 @@ def _under_environment(path, spec, views, settings, shared):
     image = realtime(path, **shared)
     way = image.meta["environment_path"]
     gates = ENVIRONMENT_GATES[way]
-    reference = converged(path, views.classes == 1, gate=gates[0], shadows=False, most=MOST, **shared)
+    reference = converged(path, views.classes == 1, gate=gates, shadows=False, most=MOST, **shared)
     some = np.zeros(views.classes.shape, bool)
     there = np.flatnonzero(np.isin(views.classes, COUNTED))
     rng = np.random.default_rng(settings.seed)

@@ -125,7 +125,7 @@ class Bench:
         key = subject, "environment"
         if key not in self._references:
             classes = pixel_classes(scene, **shared)
-            found = converged(scene, classes == 1, gate=gates[0], shadows=False, **shared)
+            found = converged(scene, classes == 1, gate=gates, shadows=False, **shared)
             self._references[key] = found, classes
         (reference, classes), image = self._references[key], made.image.copy()
         if change == "tile":

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from btfref.compare import compare
-from btfref.compare.significance import tile_equivalence
+from btfref.compare.significance import tile_equivalence, tile_half_widths
 from btfref.compare.tolerances import tolerance
 from btfref.registry import methods
 from btfref.render.classes import pixel_classes
@@ -58,8 +58,8 @@ def compared(path, scene, environment, gates, *, size=(24, 24), way="auto", **op
     file = scene_file(scene)
     image = realtime(file, environment=way, **options, **settings)
     classes = pixel_classes(file, **settings)
-    reference = converged(file, classes == 1, gate=gates[0], shadows=False, **settings)
-    if reference.meta["noise"] > reference.meta["noise_limit"]:
+    reference = converged(file, classes == 1, gate=gates, shadows=False, **settings)
+    if reference.meta["noise_ratio"] > 1:
         # Not an AssertionError: an undecided cell is no known miss.
         pytest.fail("the reference is too noisy to tell")
     return image, compare(image, reference, classes=classes, gate=gates, flip=False)
@@ -140,3 +140,19 @@ def test_tiles_have_three_outcomes(rng):
     assert outcome(0 * wrong, 1.0) == "inconclusive"
     assert outcome(wrong, 1.0) == "inconclusive"
     assert tile_equivalence(wrong, wrong, np.zeros_like(mask), tolerance=0.02) is None
+
+
+def test_the_noisiest_tile_decides_how_long(fits):
+    """All pixels together are decided long before the tile with the highlight is."""
+    file, gate = scene_file("sphere"), "image.environment_lights"
+    parameters = {"btf": str(fits.path("lpca")), "lights": "envmap", "environment": "studio"}
+    shared = {"parameters": parameters, "size": (24, 24), "grid": 2, "shadows": False}
+    mask = np.ones((24, 24), bool)
+    found = converged(file, mask, gate=gate, **shared)
+    assert found.meta["noise_ratio"] <= 1
+    relative = found.variance / found.image.mean() ** 2
+    widest = tile_half_widths(relative, mask, significance=tolerance(f"{gate}.significance")).max()
+    assert widest <= 0.5 * tolerance(f"{gate}.relative_tile_bias")
+    # The first round alone does not tell.
+    first = converged(file, mask, gate=gate, most=1, **shared)
+    assert first.meta["noise_ratio"] > 1
