@@ -135,9 +135,10 @@ class PairTable:
                 )
                 continue
             for index, light_weight in light.single():
-                total = self._blend(
-                    total, self._values(base + index, active), coefficients, weight * light_weight
-                )
+                pair_weight = weight * light_weight
+                # Pairs without weight are not fetched: they may not be there.
+                needed = active & (pair_weight != 0)
+                total = self._blend(total, self._values(base + index, needed), coefficients, pair_weight)
         return total
 
     def _values(self, entry, active):

@@ -1,23 +1,28 @@
-"""Demand: what skipping saves. Synthesis of what one scene needs against the whole, and shares of the shipped scenes.
+"""Demand: what skipping saves. Synthesis of what scenes need against the whole, and shares of the shipped scenes.
 
-A synthesis of a part costs a constant (kernels, geometry) and its share of the whole. Both are measured in one process
-with warm kernels, in turn; the constant is what a part of a single pair costs. Paths from a texel serve all lights, so
-that a few lights save less than a few views: views with all their lights are measured as well.
+A synthesis costs a constant (kernels, geometry), something per view, whose paths serve all its lights, and something
+per pair, whose shadow rays are its own. All three are fitted to the times of parts that have few and many of both;
+parts and whole are measured in turn, in one process with warm kernels.
 """
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from btfref.bench.timing import interleaved, machine, peak_memory, reset_peak, summary
 
-#: Scene with one camera and one light, for which the BTF is traced.
-ONE_LIGHT = ("plane", {"lights": "directional1"})
+#: Scenes for which the BTF is traced: one camera and one light each.
+TRACED = {
+    "plane, 1 light": ("plane", {"lights": "directional1", "tiling": "4"}),
+    "sphere, 1 light": ("sphere", {"lights": "directional1"}),
+}
 
 #: Shipped scenes, and the parameters of their frames where there are several.
 SCENES = {
@@ -29,6 +34,9 @@ SCENES = {
     "horizon": ("horizon", {}, {}),
     "turning, 8 frames": ("turning", {}, {"turn": [45 * i for i in range(8)]}),
 }
+
+#: Those of a quick run.
+QUICK_SCENES = ("plane, 1 light", "cloth, sky", "horizon")
 
 #: Methods whose maps are loaded in part.
 METHODS = ("raw", "lpca", "laplacian", "rf_lobes", "gbrdf")
@@ -42,7 +50,7 @@ def run(*, quick=False, progress=None, btf=None, only=None):
     Parameters
     ----------
     quick : bool
-        16² texels at 2 samples and one scene's size instead of 64² at 16.
+        Texels, samples, pictures, rounds and methods as few as a test has time for.
     progress : callable, optional
     btf : SampledBTF, optional
         What the methods are fitted to; default: a checker.
@@ -52,7 +60,7 @@ def run(*, quick=False, progress=None, btf=None, only=None):
     Returns
     -------
     dict
-        ``synthesis``: seconds and bytes of whole, needed part and single pair, shares, whether the pictures are equal;
+        ``synthesis``: seconds, samples and bytes of parts and whole, the law of the cost, whether pictures are equal;
         ``scenes``: by scene, shares needed, and by method those of bytes of maps, bytes read, loading time, peak memory
         of it, and frame time; ``raw``;
         ``parameters``; ``machine``.
@@ -68,90 +76,136 @@ def run(*, quick=False, progress=None, btf=None, only=None):
 
 
 def synthesis(folder, quick, progress):
-    """One camera and one light before a plane: the part that they need against the whole."""
+    """Parts that scenes need against the whole: times, their law, bytes, pictures."""
     from btfref.demand import demand
     from btfref.numerics.directions import directions
-    from btfref.render.reference import render
-    from btfref.representations import raw, save
-    from btfref.sampling import SampledBTF, open_store
     from btfref.sampling.part import Part
     from btfref.sampling.synthesis import synthesize_store
     from btfref.scenes import scene_file
 
-    texels, spp = (16, 2) if quick else (64, 16)
-    scene, parameters = ONE_LIGHT
-    parameters = parameters | {"tiling": "4"}
-    ubo = directions("ubo81")
-    start = time.perf_counter()
-    (needed,) = demand(
-        scene_file(scene), parameters=parameters, shape=(ubo, ubo, (texels, texels)), grid=4
-    ).values()
-    seconds_demand = time.perf_counter() - start
-    views = needed.part().views
-    parts = {
-        BASELINE: None,
-        "needed": needed.part(),
-        "its views, all lights": Part(views),
-        "single pair": Part((0,), (0,)),
-    }
-
-    def task(name, part):
-        def synthesize():
-            path = folder / f"{name}.btf.zarr"
-            shutil.rmtree(path, ignore_errors=True)
-            settings = {"texels": texels, "spp": spp, "views": "ubo81", "lights": "ubo81"}
-            synthesize_store(path, "checker", only=part, **settings)
-
-        return synthesize
-
-    progress(0, 2, "synthesis")
-    # Two views of all lights, and the small parts, warm all kernels up: the whole once more would take minutes.
-    for part in (Part(views[:2]), parts["needed"], parts["single pair"]):
-        task("warm-up", part)()
-    seconds = {}
-    for name, part in parts.items():
+    texels, spp, rounds = (8, 2, 1) if quick else (64, 8, 3)
+    size = (32, 32) if quick else (256, 256)
+    directions_name = "3x6" if quick else "ubo81"
+    known = directions(directions_name)
+    needed, seconds_demand = {}, {}
+    for name, (scene, parameters) in TRACED.items():
+        progress(len(needed), len(TRACED), "first hits")
         start = time.perf_counter()
-        task(name, part)()
-        seconds[name] = [time.perf_counter() - start]
-    size = {name: _bytes(folder / f"{name}.btf.zarr") for name in parts}
-    progress(1, 2, "pictures")
-    images, maps = {}, {}
-    for name, made in (
-        ("needed", raw.fit_partial(open_store(folder / "needed.btf.zarr"))),
-        (BASELINE, raw.fit(SampledBTF.load(folder / f"{BASELINE}.btf.zarr", variance=False))),
-    ):
-        path = folder / f"{name}.raw.exr"
-        save(made, path)
-        maps[name] = made.maps["values"].nbytes
-        images[name] = render(
-            scene_file(scene), parameters=parameters | {"btf": str(path)}, noise_free=4
-        ).image
-    found = summary(seconds, BASELINE)
-    count = {
-        "needed": int(needed.views.sum() * needed.lights.sum()),
-        BASELINE: needed.pairs.size,
-        "single pair": 1,
+        (needed[name],) = demand(
+            scene_file(scene),
+            parameters=parameters,
+            shape=(known, known, (texels, texels)),
+            grid=2,
+            size=size,
+        ).values()
+        seconds_demand[name] = time.perf_counter() - start
+    few = needed["plane, 1 light"]
+    views, lights = (tuple(np.flatnonzero(mask).tolist()) for mask in (few.views, few.lights))
+    parts = {BASELINE: None} | {name: one.part() for name, one in needed.items()}
+    parts |= {
+        "its views, all lights": Part(views),
+        "its lights, all views": Part(None, lights),
+        "its views, one light": Part(views, lights[:1]),
+        "single pair": Part(views[:1], lights[:1]),
     }
-    constant = found["single pair"]["ratio"]
-    share, share_of_views = count["needed"] / count[BASELINE], len(views) / len(needed.views)
+    settings = {"texels": texels, "spp": spp, "views": directions_name, "lights": directions_name}
+    pairs, seconds = {}, {name: [] for name in parts}
+    # Parts warm all kernels up: the whole once more would take a minute.
+    warm_up = [] if quick else [(name, False) for name in parts if name != BASELINE]
+    turns = warm_up + [(name, True) for _ in range(rounds) for name in parts]
+    for number, (name, counted) in enumerate(turns):
+        progress(number, len(turns), "synthesis")
+        path = folder / f"{name}.btf.zarr"
+        shutil.rmtree(path, ignore_errors=True)
+        start = time.perf_counter()
+        store = synthesize_store(path, "checker", only=parts[name], **settings)
+        if counted:
+            seconds[name].append(time.perf_counter() - start)
+        pairs[name] = store.coverage.all((2, 3))
+    found = summary(seconds, BASELINE)
+    counts = {name: (int(mask.any(1).sum()), int(mask.sum())) for name, mask in pairs.items()}
+    law = cost_law({name: (*counts[name], found[name]["median_s"]) for name in parts})
+    whole = found[BASELINE]["median_s"]
+    rows = {}
+    for name, (n_views, n_pairs) in counts.items():
+        share = n_pairs / counts[BASELINE][1]
+        rows[name] = {
+            "views": n_views,
+            "pairs": n_pairs,
+            "share_of_samples": share,
+            "seconds": found[name],
+            "slope": (found[name]["median_s"] - law["constant_s"]) / whole / share,
+            "law_s": law["constant_s"] + law["view_s"] * n_views + law["pair_s"] * n_pairs,
+            "share_of_bytes": _bytes(folder / f"{name}.btf.zarr") / _bytes(folder / f"{BASELINE}.btf.zarr"),
+        }
+    pictures = {}
+    for number, name in enumerate(TRACED):
+        progress(number, len(TRACED), "pictures")
+        pictures[name] = _pictures(folder, name, size)
+        rows[name] |= pictures[name] | {"seconds_demand": seconds_demand[name]}
     return {
         "texels": texels,
         "spp": spp,
+        "rounds": rounds,
         "raw": seconds,
-        "summary": found,
-        "seconds_demand": seconds_demand,
-        "views": int(needed.views.sum()),
-        "lights": int(needed.lights.sum()),
-        "share_of_samples": share,
-        "share_of_time": found["needed"]["ratio"],
-        "constant_of_time": constant,
-        "slope": (found["needed"]["ratio"] - constant) / share,
-        "share_of_views": share_of_views,
-        "slope_of_views": (found["its views, all lights"]["ratio"] - constant) / share_of_views,
-        "bytes": size,
-        "share_of_bytes": size["needed"] / size[BASELINE],
-        "share_of_map_bytes": maps["needed"] / maps[BASELINE],
-        "equal_pictures": bool(np.array_equal(images["needed"], images[BASELINE])),
+        "parts": rows,
+        "law": law,
+        "equal_pictures": all(one["equal_picture"] for one in pictures.values()),
+    }
+
+
+def cost_law(parts):
+    """Constant, seconds per view and per pair from the times of parts: t = a + b views + c pairs, none below 0.
+
+    Parameters
+    ----------
+    parts : dict of str to (int, int, float)
+        Views, pairs and seconds; at least four.
+
+    Returns
+    -------
+    dict
+        ``constant_s``, ``view_s``, ``pair_s``; ``lights_per_view``: lights that cost as much as the view they belong
+        to; ``largest_residual``: of a part's time, relative.
+    """
+    from scipy.optimize import nnls
+
+    n_views, n_pairs, seconds = np.array(list(parts.values()), float).T
+    # Relative errors: short parts count as much as the whole.
+    columns = np.stack([np.ones(len(seconds)), n_views, n_pairs], 1) / seconds[:, None]
+    law, _ = nnls(columns, np.ones(len(seconds)))
+    return {
+        "constant_s": float(law[0]),
+        "view_s": float(law[1]),
+        "pair_s": float(law[2]),
+        "lights_per_view": float(law[1] / law[2]) if law[2] > 0 else None,
+        "largest_residual": float(np.abs(columns @ law - 1).max()),
+    }
+
+
+def _pictures(folder, name, size):
+    """The scene's picture from what was traced for it and from the whole: whether equal, and shares of the table."""
+    from btfref.render.reference import render
+    from btfref.representations import raw, save
+    from btfref.sampling import SampledBTF, open_store
+    from btfref.scenes import scene_file
+
+    scene, parameters = TRACED[name]
+    images, maps, files = [], [], []
+    for label, made in (
+        ("part", raw.fit_partial(open_store(folder / f"{name}.btf.zarr"))),
+        (BASELINE, raw.fit(SampledBTF.load(folder / f"{BASELINE}.btf.zarr", variance=False))),
+    ):
+        path = folder / f"{label}.raw.exr"
+        save(made, path)
+        maps.append(made.maps["values"].nbytes)
+        files.append(path.stat().st_size)
+        shown = render(scene_file(scene), parameters=parameters | {"btf": str(path)}, noise_free=2, size=size)
+        images.append(shown.image)
+    return {
+        "share_of_map_bytes": maps[0] / maps[1],
+        "share_of_file_bytes": files[0] / files[1],
+        "equal_picture": bool(np.array_equal(*images)),
     }
 
 
@@ -164,63 +218,71 @@ def scenes(folder, btf, quick, progress):
     from btfref.scenes import scene_file
 
     btf = btf or checker(texels=16 if quick else 64, spp=2, progress=progress)
-    paths = {key: folder / f"scenes.{key}.exr" for key in METHODS}
-    for key, path in paths.items():
+    methods = METHODS[1:2] if quick else METHODS
+    paths = {key: folder / f"scenes.{key}.exr" for key in methods}
+    for number, (key, path) in enumerate(paths.items()):
+        progress(number, len(paths), "fits")
         save(method(key).fit(btf), path)
     whole = {key: load(path) for key, path in paths.items()}
-    size, rounds = ((64, 64), 1) if quick else ((256, 256), 5)
-    found = {}
-    for number, (name, (scene, fixed, frames)) in enumerate(SCENES.items()):
-        progress(number, len(SCENES), name)
-        file = scene_file(scene)
-        steps = [{key: str(v)} for key, values in frames.items() for v in values] or [{}]
-        entry = {"methods": {}}
-        for key, path in paths.items():
-            one, kept = None, None
+    size, rounds = ((32, 32), 1) if quick else ((256, 256), 5)
+    shown = [name for name in SCENES if not quick or name in QUICK_SCENES]
+    found, turns = {}, list(itertools.product(shown, paths))
+    for number, (name, key) in enumerate(turns):
+        progress(number, len(turns), name)
+        scene, fixed, frames = SCENES[name]
+        file, path = scene_file(scene), paths[key]
+        steps = [{k: str(v)} for k, values in frames.items() for v in values] or [{}]
+        steps = steps[:1] if quick else steps
+        if key == next(iter(paths)):
+            shared, found[name] = None, {"methods": {}}
+        # What a scene needs depends on the method only where lookups leave their texture coordinates.
+        elsewhere = hasattr(whole[key], "seen_texels")
+        one = None if elsewhere else shared
+        if one is None:
             for step in steps:
                 parameters = fixed | step | {"btf": str(path)}
-                (some,) = demand(file, parameters=parameters, grid=2, size=size).values()
+                (some,) = demand(file, parameters=parameters, grid=1 if quick else 2, size=size).values()
                 one = some if one is None else one | some
-            kept = choice(one)
-            entry["shares"] = {what: n / m for what, (n, m) in one.shares().items()}
-            times = interleaved(
-                {
-                    "all": lambda path=path: load(path),
-                    "needed": lambda path=path, kept=kept: load(path, **kept),
-                },
-                rounds,
-            )
-            entry["methods"][key] = {
-                "bytes": _payload(load(path, **kept)) / _payload(whole[key]),
-                "read": _bytes_read(path, kept) / path.stat().st_size,
-                "load": summary(times, "all")["needed"],
-                "memory": _memory(
-                    lambda path=path, kept=kept: load(path, **kept), lambda path=path: load(path)
-                ),
-                "frame": _frames(file, parameters, kept, size, rounds),
-                "raw": times,
-                "maps": {what: n / m for what, (n, m) in maps_needed(one, whole[key]).maps.items()},
-            }
-        found[name] = entry
+            shared = shared if elsewhere else one
+        one = replace(one, file=str(path))
+        kept, entry = choice(one), found[name]
+        entry.setdefault("shares", {what: n / m for what, (n, m) in one.shares().items()})
+        times = interleaved(
+            {
+                "all": lambda path=path: load(path),
+                "needed": lambda path=path, kept=kept: load(path, **kept),
+            },
+            rounds,
+        )
+        some = load(path, **kept)
+        parameters = fixed | steps[-1] | {"btf": str(path)}
+        entry["methods"][key] = {
+            "bytes": _payload(some) / _payload(whole[key]),
+            "read": _bytes_read(path, kept) / path.stat().st_size,
+            "load": summary(times, "all")["needed"],
+            "memory": _memory(lambda path=path, kept=kept: load(path, **kept), lambda path=path: load(path)),
+            "frame": _frames(file, parameters, whole[key], some, size, rounds),
+            "raw": times,
+            "maps": {what: n / m for what, (n, m) in maps_needed(one, whole[key]).maps.items()},
+        }
     return found
 
 
-def _frames(file, parameters, kept, size, rounds):
+def _frames(file, parameters, whole, some, size, rounds):
     """Times of real-time frames with the needed maps alone over those with all, in turn.
 
     None with an environment, whose light comes from tables that are made of all maps.
     """
     from btfref.render.realtime import Renderer
     from btfref.render.scene import read_scene
-    from btfref.representations import load
 
     scene = read_scene(file, parameters, size=size)
     if scene.environment is not None:
         return None
-    with Renderer(scene) as whole, Renderer(scene, lambda path: load(path, **kept)) as some:
+    with Renderer(scene, lambda path: whole) as first, Renderer(scene, lambda path: some) as second:
         times = {"all": [], "needed": []}
         for number in range(rounds + 1):
-            for name, renderer in (("all", whole), ("needed", some)):
+            for name, renderer in (("all", first), ("needed", second)):
                 seconds = 1e-3 * renderer.draw()
                 if number:
                     times[name].append(seconds)
@@ -257,32 +319,33 @@ def _bytes(path):
     return sum(entry.stat().st_size for entry in path.rglob("*") if entry.is_file())
 
 
-def _spread(entry):
+def _spread(entry, digits=0):
     """Median ratio with its extremes, in percent."""
-    return " ".join(
-        [
-            f"{100 * entry['ratio']:.0f} %",
-            f"({100 * entry['ratio_min']:.0f} … {100 * entry['ratio_max']:.0f})",
-        ]
-    )
+    middle, least, most = (f"{100 * entry[name]:.{digits}f}" for name in ("ratio", "ratio_min", "ratio_max"))
+    return f"{middle} % ({least} … {most})"
 
 
 def table(result):
     """Rows for people: what is needed of what, and what it costs."""
     rows = []
     if one := result.get("synthesis"):
-        name = "synthesis for one camera, one light"
-        rows += [
-            (name, "samples", f"{100 * one['share_of_samples']:.2f} %"),
-            (name, "time", f"{100 * one['share_of_time']:.2f} %"),
-            (name, "time of a single pair (the constant)", f"{100 * one['constant_of_time']:.2f} %"),
-            (name, "(time − constant) / samples", f"{one['slope']:.2f}"),
-            (name, "views", f"{100 * one['share_of_views']:.2f} %"),
-            (name, "(time of its views with all lights − constant) / views", f"{one['slope_of_views']:.2f}"),
-            (name, "bytes of the store", f"{100 * one['share_of_bytes']:.2f} %"),
-            (name, "bytes of the table", f"{100 * one['share_of_map_bytes']:.2f} %"),
-            (name, "pictures equal bit by bit", str(one["equal_pictures"])),
-        ]
+        for name, part in one["parts"].items():
+            what = "synthesis: " + (f"of what {name} needs" if name in TRACED else name)
+            text = f"{part['views']} views, {part['pairs']} pairs: {100 * part['share_of_samples']:.2f} % of samples, "
+            text += f"{part['seconds']['median_s']:.2f} s, {_spread(part['seconds'], 2)} of the time, "
+            text += f"law {part['law_s']:.2f} s, (time − constant) / samples {part['slope']:.2f}, "
+            text += f"{100 * part['share_of_bytes']:.2f} % of the bytes"
+            if "equal_picture" in part:
+                table_share, file_share = part["share_of_map_bytes"], part["share_of_file_bytes"]
+                text += f", table {100 * table_share:.1f} %, its file {100 * file_share:.1f} %"
+                text += f", pictures equal bit by bit: {part['equal_picture']}, found in {part['seconds_demand']:.1f} s"
+            rows.append((what, "", text))
+        law = one["law"]
+        text = f"{law['constant_s']:.2f} s + {1e3 * law['view_s']:.1f} ms per view"
+        text += f" + {1e3 * law['pair_s']:.2f} ms per pair"
+        if law["lights_per_view"] is not None:
+            text += f"; a view costs as much as {law['lights_per_view']:.1f} lights"
+        rows.append(("synthesis: law", "", f"{text}; off by {100 * law['largest_residual']:.0f} % at most"))
     for scene, entry in result.get("scenes", {}).items():
         rows += [(scene, what, f"{100 * share:.1f} %") for what, share in entry["shares"].items()]
         for key, costs in entry["methods"].items():

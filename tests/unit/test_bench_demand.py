@@ -1,0 +1,63 @@
+"""The suite demand: parts against the whole, the law of their cost, shares of the shipped scenes."""
+
+import json
+
+import pytest
+
+from btfref.bench.demand import BASELINE, QUICK_SCENES, TRACED, cost_law, table
+from btfref.bench.demand import run as run_suite
+from btfref.cli import main
+
+
+def test_law_of_the_cost():
+    parts = {
+        str(n): (v, p, 0.5 + 0.05 * v + 0.01 * p)
+        for n, (v, p) in enumerate([(1, 1), (13, 52), (13, 1053), (81, 6561)])
+    }
+    law = cost_law(parts)
+    assert law["constant_s"] == pytest.approx(0.5)
+    assert law["view_s"] == pytest.approx(0.05)
+    assert law["pair_s"] == pytest.approx(0.01)
+    assert law["lights_per_view"] == pytest.approx(5)
+    assert law["largest_residual"] < 1e-9
+    # Times that follow no such law are told: a part that takes twice as long as it should.
+    parts["again"] = (*parts["1"][:2], 2 * parts["1"][2])
+    assert cost_law(parts)["largest_residual"] > 0.1
+
+
+def test_quick_synthesis(need, llvm, capsys):
+    assert main(["bench", "demand", "--quick", "--only", "synthesis", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["synthesis"]
+    assert found["equal_pictures"]
+    parts = found["parts"]
+    assert set(TRACED) < set(parts)
+    whole, plane, sphere = (parts[name] for name in (BASELINE, *TRACED))
+    assert whole["pairs"] == whole["views"] ** 2
+    assert parts["single pair"]["pairs"] == 1
+    assert plane["pairs"] < 0.5 * whole["pairs"]
+    assert plane["share_of_bytes"] < 1.1 * plane["share_of_samples"] + 0.1
+    # All views of a sphere are needed, and some of their lights each.
+    assert sphere["views"] > 0.9 * whole["views"]
+    assert plane["pairs"] < sphere["pairs"] < whole["pairs"]
+    assert whole["share_of_samples"] == whole["share_of_bytes"] == 1
+    assert found["law"]["pair_s"] > 0
+
+
+def test_quick_scenes(need, fits):
+    need("llvm")
+    need("gl")
+    result = run_suite(quick=True, btf=fits.btf(), only=["scenes"])
+    scenes = result["scenes"]
+    assert set(scenes) == set(QUICK_SCENES)
+    for entry in scenes.values():
+        for costs in entry["methods"].values():
+            assert 0 < costs["bytes"] <= 1
+            assert 0 < costs["read"] <= 1
+            assert costs["load"]["median_s"] > 0
+    assert (
+        scenes["plane, 1 light"]["methods"]["lpca"]["bytes"]
+        < scenes["cloth, sky"]["methods"]["lpca"]["bytes"]
+    )
+    assert scenes["cloth, sky"]["methods"]["lpca"]["frame"] is None
+    assert scenes["horizon"]["methods"]["lpca"]["frame"]["median_s"] > 0
+    assert len(table(result)[1]) >= len(QUICK_SCENES) * 6
