@@ -30,7 +30,7 @@ from btfref.errors import InputError
 SAMPLES = (16, 64)
 
 #: Surface points a texel for about the errors of these samples. Errors stand beside the times.
-POINTS = {"checker": (10, 30), "rings": (25, 80), "tissue": (18, 60)}
+POINTS = {"checker": (10, 28), "rings": (25, 80), "tissue": (18, 52)}
 
 #: Independent runs whose spread is the noise of an image's mean; the timed rounds are among them.
 RUNS = {"naive": 12, "path": 8, "surface": 12}

@@ -27,8 +27,8 @@ PER_TRIANGLE = 400
 #: view: bins and walks from texels. Measured at 64² texels and 81 lights and views, results of 304 MiB included:
 #: checker of 10 points 1919 MiB, tissue of 18 points 2395, rings of 25 points 3158; the sums say 2290, 3430, 4420.
 #: Rings of 40 points, 81 lights and 14 of the views 3080 MiB, 14 lights and all views 4308; the sums say 3309, 4542.
-#: At 128² texels (checker of 10 points: 2860 MiB, 6319) walks are followed in batches of the same size: the sums are
-#: then twice too large.
+#: Larger ones (checker of 10 points at 128²: 2860 MiB, 6319; at 256²: 7692, 23 638) follow their walks in batches of
+#: the same size: the sums are then two to three times too large, which is on the safe side.
 PER_POINT, PER_POINT_LIGHT, PER_POINT_VIEW = 600, 160, 280
 
 #: Bytes of the surface estimator's buffers, whatever the size of the BTF.
