@@ -263,11 +263,15 @@ class SharedPoints(_Subject):
 
     def images(self, seed):
         """Images of the pairs, of the whole BTF where it was made; else points and walks of their directions alone."""
+        import drjit as dr
+
         from btfref.sampling.surface_estimator import SurfaceEstimator
 
         if seed in self.full:
             return self.full[seed]
         gc.collect()
+        # What whole BTFs left for reuse is of other sizes, and other methods' processes wait beside this one.
+        dr.flush_malloc_cache()
         settings = self.settings | {"wanted": self.views, "variance": False, "seed": seed}
         return self._chosen(
             SurfaceEstimator(self.tile, self.vectors[self.lights], views=self.vectors, **settings)
