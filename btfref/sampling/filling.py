@@ -91,38 +91,51 @@ def _fill_by_texels(job, store, views, only, plan, size):
     wanted = np.zeros(store.coverage_shape, bool)
     wanted[tiles] = True
     estimator = job.make_estimator(views, buffer=size.buffer)
-    columns = store.texels[1]
+    requests = _requests(store, views, pairs, wanted, plan)
+    for request, *found in estimator.estimate_all(requests):
+        row, column, chosen, inside, last = request.tag
+        if len(request.texel):
+            at = np.nonzero(inside)
+            shape = (len(request.lights), *inside.shape, 3)
+            result = []
+            for values in found[: 1 + store.has_variance]:
+                if not inside.all():
+                    whole = np.zeros(shape, np.float32)
+                    whole[:, *at] = values
+                    values = whole
+                result.append(values.reshape(shape))
+            if plan is not None:
+                _record_part(store, request.view, row, column, inside, adaptive.texel_means(*result))
+            origin = (row.start, column.start)
+            store.write_part(request.view, request.lights, tuple(chosen), *result, origin=origin)
+        if last:
+            yield request.view
+
+
+def _requests(store, views, pairs, wanted, plan):
+    """What is missing of some views, file by file; with where it goes, and whether it is the last of its view."""
+    from btfref.sampling.texel_paths import Request
+
+    regions = list(_regions(store))
     for view in views:
         absent = pairs[view][:, None, None] & wanted & ~store.covered(view)
         lights, missing = np.flatnonzero(absent.any((1, 2))), absent.any(0)
-        estimator.choose(lights)
-        counts = None
+        counts, stream = None, ()
         if plan is not None:
-            counts = plan.counts(store.maps("pilot")[view])
+            counts, stream = plan.counts(store.maps("pilot")[view]), (_ESTIMATE,)
             store.write_map("samples", view, counts)
-        for (row, column), region in _regions(store):
-            chosen = region[:, missing[tuple(region)]]
-            if not chosen.shape[1]:
-                continue
+        for number, ((row, column), region) in enumerate(regions, 1):
             inside = missing[np.ix_(_tile_of(row, store.tile[0]), _tile_of(column, store.tile[1]))]
-            at = np.argwhere(inside)
-            texel = (row.start + at[:, 0]) * columns + column.start + at[:, 1]
-            shape = (len(lights), row.stop - row.start, column.stop - column.start, 3)
-            result = []
-            for values in estimator.estimate(
-                view, texel, *(() if plan is None else (counts.ravel()[texel], (_ESTIMATE,)))
-            ):
-                if len(at) < inside.size:
-                    whole = np.zeros(shape, np.float32)
-                    whole[:, at[:, 0], at[:, 1]] = values
-                    values = whole
-                result.append(values.reshape(shape))
-            if not store.has_variance:
-                result = result[:1]
-            if plan is not None:
-                _record_part(store, view, row, column, inside, adaptive.texel_means(*result))
-            store.write_part(view, lights, tuple(chosen), *result, origin=(row.start, column.start))
-        yield view
+            rows, columns = np.nonzero(inside)
+            texel = (row.start + rows) * store.texels[1] + column.start + columns
+            yield Request(
+                view,
+                texel,
+                lights,
+                None if counts is None else counts.ravel()[texel],
+                stream,
+                (row, column, region[:, missing[tuple(region)]], inside, number == len(regions)),
+            )
 
 
 def _tile_of(part, side):

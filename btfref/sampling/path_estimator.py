@@ -11,10 +11,11 @@ the same for all lights, so the lights of a texel are correlated, its samples ar
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
-from btfref.sampling.tiled_scene import START, TiledScene, stream_keys, uniforms
+from btfref.sampling.tiled_scene import TiledScene, uniforms
 
 #: Memory (bytes) of the sample buffer of one pass; reduction needs about three times that.
 SAMPLE_BUFFER = 96 << 20
@@ -48,8 +49,35 @@ def strata(spp):
     return n // rows, rows, per_stratum
 
 
+@dataclass
+class Piece:
+    """Lanes of one pass that share a view and its lights.
+
+    Attributes
+    ----------
+    w_view : ndarray, shape (3,)
+    keys : sequence of two int
+        Random stream.
+    lights : ndarray, shape (n_lit, 3)
+        Above the horizon, at least one.
+    n_lanes : int
+    """
+
+    w_view: np.ndarray
+    keys: tuple
+    lights: np.ndarray
+    n_lanes: int
+
+    @property
+    def size(self):
+        """Numbers of the sample buffer: [light, channel, lane]."""
+        return 3 * len(self.lights) * self.n_lanes
+
+
 class PathEstimator:
-    """Radiance of all texels for one view and all lights, by path tracing with light connections.
+    """Samples of lanes, each with a view and lights of its own, by path tracing with light connections.
+
+    Subclasses say which texel a lane belongs to (`_footprint`) and which random stream it has (`_stream`).
 
     Parameters
     ----------
@@ -63,8 +91,7 @@ class PathEstimator:
     seed : int
     max_depth : int
         As in Mitsuba's path integrator: 2 is direct light only, −1 has no limit.
-    views : ndarray, shape (n_views, 3), optional
-        Needed for `all_views` only.
+    views : ndarray, shape (n_views, 3)
     wanted : sequence of int, optional
         Not used: views are independent of each other.
     mask : ndarray (rows · columns,) bool, optional
@@ -83,95 +110,29 @@ class PathEstimator:
     ):
         self.texels, self.spp, self.seed = tuple(texels), int(spp), int(seed)
         self.max_depth, self.views, self.mask = int(max_depth), views, mask
-        self._vectors = np.asarray(lights, dtype=np.float64)
-        self.tiles = TiledScene(mesostructure, self._vectors)
+        self.lights = np.asarray(lights, dtype=np.float64)
+        self.tiles = TiledScene(mesostructure, self.lights)
         self._buffer = None
-        self.choose()
 
-    def choose(self, lights=None):
-        """Make results of some lights from now on; those of a light do not depend on which others are made.
-
-        Parameters
-        ----------
-        lights : ndarray of int, optional
-            Indices; all when not given.
-        """
+    def _paths(self, pieces):
+        """Fill the buffer with the samples of one pass: lanes and samples of its pieces one after the other."""
         import drjit as dr
         import mitsuba as mi
 
-        vectors = self._vectors if lights is None else self._vectors[lights]
-        self.n_lights = len(vectors)
-        self.lit = np.flatnonzero(vectors[:, 2] > 0)
-        self.lights = mi.Float(vectors[self.lit].astype(np.float32).ravel())
-        dr.eval(self.lights)
-
-    @property
-    def texels_per_pass(self):
-        """Texels traced together; a bound on memory, without influence on the result."""
-        lanes = max(SAMPLE_BUFFER // (12 * max(len(self.lit), 1)), 1)
-        return max(1, min(self.texels[0] * self.texels[1], lanes // self.spp))
-
-    def all_views(self, views):
-        """Yield (view, mean, variance) of views, one after the other; see `view`."""
-        for index in views:
-            yield index, *self.view(index, self.views[index])
-
-    def view(self, index, w_view):
-        """Mean and variance of the mean for one view.
-
-        Parameters
-        ----------
-        index : int
-            Number of the view in the full set: with the seed it fixes the random numbers.
-        w_view : array_like, shape (3,)
-            Unit vector.
-
-        Returns
-        -------
-        mean, variance : ndarray, shape (n_lights, rows, columns, 3), float32
-            B in 1/sr, and the variance of that mean.
-        """
-        rows, columns = self.texels
-        mean = np.zeros((self.n_lights, rows * columns, 3), np.float32)
-        variance = np.zeros_like(mean)
-        if w_view[2] > 0 and len(self.lit):
-            keys = stream_keys(self.seed, int(index))
-            step = self.texels_per_pass
-            for first in range(0, rows * columns, step):
-                last = min(first + step, rows * columns)
-                if self.mask is not None and not self.mask[first:last].any():
-                    continue
-                part = self._texels(first, last - first, np.asarray(w_view, dtype=np.float64), keys)
-                # Advanced index beside a slice: (n_lit, texels, 3) on both sides.
-                mean[self.lit, first:last] = part[0]
-                variance[self.lit, first:last] = part[1]
-        return mean.reshape(-1, rows, columns, 3), variance.reshape(-1, rows, columns, 3)
-
-    def _texels(self, first, n_texels, w_view, keys):
-        """Statistics of texels first … first + n_texels − 1, as two (n_lit, n_texels, 3) arrays."""
-        self._paths(n_texels * self.spp, first * self.spp, w_view, keys)
-        return self._statistics(len(self.lit), n_texels)
-
-    def _paths(self, n_lanes, first, w_view, keys):
-        """Fill the buffer with the samples of one pass, whose streams begin at `first`."""
-        import drjit as dr
-        import mitsuba as mi
-
-        n_lit = len(self.lit)
-        if self._buffer is None or dr.width(self._buffer) != 3 * n_lit * n_lanes:
-            # Touching new memory costs as much as filling it: one buffer serves all views of equally many lights.
-            self._buffer = dr.empty(mi.Float, 3 * n_lit * n_lanes)
-        # Everything that changes between views is opaque: one kernel then serves all of them.
-        first = dr.opaque(mi.UInt32, first)
-        n_lanes_opaque = dr.opaque(mi.UInt32, n_lanes)
-        lane = dr.arange(mi.UInt32, n_lanes)
-        w_view = mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in w_view))
-        origin = self._footprint(lane + first, keys, w_view)
+        size = sum(piece.size for piece in pieces)
+        if self._buffer is None or dr.width(self._buffer) != size:
+            # Touching new memory costs as much as filling it: one buffer serves all passes of a size.
+            self._buffer = dr.empty(mi.Float, size)
+        self._tell(pieces)
+        # Everything that changes between passes is in arrays: one kernel then serves all of them.
+        lane = dr.arange(mi.UInt32, sum(piece.n_lanes for piece in pieces))
+        w_view = dr.gather(mi.Vector3f, self._views, dr.gather(mi.UInt32, self._piece, lane))
+        origin = self._footprint(lane, self._keys(lane), w_view)
         state = (lane, origin, mi.Vector3f(-w_view), mi.Color3f(1.0))
         n_vertices = self.max_depth - 1 if self.max_depth > 0 else 2**31
         vertex = 1
         while vertex <= n_vertices:
-            state, alive = self._vertex(state, vertex, first, keys, n_lanes_opaque)
+            state, alive = self._vertex(state, vertex)
             if vertex == n_vertices:
                 break
             # Most paths leave after the first vertex: the survivors are packed, or SIMD lanes idle.
@@ -181,26 +142,34 @@ class PathEstimator:
             state = tuple(dr.gather(type(value), value, survivors) for value in state)
             vertex += 1
 
-    def _stream(self, lane, first):
-        """Number of the random stream of a lane of this pass: the sample's own, whatever the pass."""
-        return lane + first
-
-    def _footprint(self, lane, keys, w_view):
-        """Start of the view rays: a stratified point of the lane's texel square, moved up along w_view."""
-        import drjit as dr
+    def _tell(self, pieces):
+        """Tables of the pieces, and the piece of each lane."""
         import mitsuba as mi
 
-        columns, rows, per_stratum = strata(self.spp)
-        texel, sample = lane // self.spp, lane % self.spp
-        stratum = sample // per_stratum
-        u, v, _, _ = uniforms(lane, keys, mi.UInt32(0))
-        u = (mi.Float(stratum % columns) + u) / columns
-        v = (mi.Float(stratum // columns) + v) / rows
-        x = (mi.Float(texel % self.texels[1]) + u) / self.texels[1]
-        y = (mi.Float(texel // self.texels[1]) + v) / self.texels[0]
-        return dr.fma(mi.Vector3f(w_view), START, mi.Point3f(x, y, 0))
+        lanes, sizes, lit = (
+            np.array([count(piece) for piece in pieces])
+            for count in (lambda p: p.n_lanes, lambda p: p.size, lambda p: len(p.lights))
+        )
+        first, base, start = (np.cumsum(a) - a for a in (lanes, sizes, lit))
+        words = [[piece.keys[k] for piece in pieces] for k in (0, 1)]
+        # Samples of a lane: base − first lane of the piece + lane + 3 n_lanes times the light.
+        words = np.stack([*words, start, lit, base - first, lanes], 1).astype(np.int64) % 2**32
+        self._piece = mi.UInt32(np.repeat(np.arange(len(pieces), dtype=np.uint32), lanes))
+        self._words = mi.UInt32(words.astype(np.uint32).ravel())
+        self._views = mi.Float(np.array([piece.w_view for piece in pieces], np.float32).ravel())
+        self._lights = mi.Float(np.concatenate([piece.lights for piece in pieces]).astype(np.float32).ravel())
 
-    def _vertex(self, state, number, first, keys, n_lanes):
+    def _word(self, lane, number):
+        import drjit as dr
+
+        piece = dr.gather(type(lane), self._piece, lane)
+        return dr.gather(type(lane), self._words, piece * 6 + number)
+
+    def _keys(self, lane):
+        """Words that select the random streams of the lanes' pieces."""
+        return [self._word(lane, 0), self._word(lane, 1)]
+
+    def _vertex(self, state, number):
         """Trace to the next vertex, connect it to all lights, sample the way on; one kernel."""
         import drjit as dr
         import mitsuba as mi
@@ -211,10 +180,11 @@ class PathEstimator:
         active = interaction.is_valid()
         bsdf = interaction.bsdf()
         context = mi.BSDFContext()
-        self._connect(interaction, bsdf, context, throughput, lane, active, n_lanes, first_vertex=number == 1)
+        self._connect(interaction, bsdf, context, throughput, lane, active, first_vertex=number == 1)
 
-        lobe, u, v, _ = uniforms(self._stream(lane, first), keys, 2 * depth)
-        roulette, _, _, _ = uniforms(self._stream(lane, first), keys, 2 * depth + 1)
+        stream, keys = self._stream(lane), self._keys(lane)
+        lobe, u, v, _ = uniforms(stream, keys, 2 * depth)
+        roulette, _, _, _ = uniforms(stream, keys, 2 * depth + 1)
         sample, weight = bsdf.sample(context, interaction, lobe, mi.Point2f(u, v), active)
         throughput = throughput * weight
         survival = dr.minimum(dr.max(throughput), ROULETTE_LIMIT)
@@ -226,20 +196,22 @@ class PathEstimator:
         dr.eval(state, alive)
         return state, alive
 
-    def _connect(self, interaction, bsdf, context, throughput, lane, active, n_lanes, *, first_vertex):
-        """Add throughput · f cos · visibility of every light to the lane's samples."""
+    def _connect(self, interaction, bsdf, context, throughput, lane, active, *, first_vertex):
+        """Add throughput · f cos · visibility of each of the lane's lights to its samples."""
         import drjit as dr
         import mitsuba as mi
 
-        buffer, lights, n_lit = self._buffer, self.lights, dr.opaque(mi.UInt32, len(self.lit))
+        buffer, lights = self._buffer, self._lights
+        start, n_lit, base, n_lanes = (self._word(lane, number) for number in (2, 3, 4, 5))
+        mine = base + lane
 
         def connect(i):
-            w_light = dr.gather(mi.Vector3f, lights, i)
+            w_light = dr.gather(mi.Vector3f, lights, start + i)
             value = throughput * bsdf.eval(context, interaction, interaction.to_local(w_light), active)
             lit = active & (dr.max(value) > 0)
             ray = interaction.spawn_ray(w_light)
             lit &= ~self.tiles.occluded(ray, lit)
-            index = dr.fma(i, 3 * n_lanes, lane)
+            index = dr.fma(i, 3 * n_lanes, mine)
             for channel in range(3):
                 at = index + channel * n_lanes
                 # Each lane owns its entries: no atomics. The first vertex overwrites the last view's samples.
@@ -251,8 +223,8 @@ class PathEstimator:
 
         dr.while_loop((mi.UInt32(0) + dr.zeros(mi.UInt32, dr.width(lane)),), lambda i: i < n_lit, connect)
 
-    def _statistics(self, n_lit, n_texels):
-        """Mean and variance of the mean from the samples of the last pass."""
+    def _statistics(self, pieces):
+        """Mean and variance of the mean from the samples of the last pass: two (n_lit, texels, 3) arrays a piece."""
         import drjit as dr
 
         _, _, per_stratum = strata(self.spp)
@@ -262,5 +234,9 @@ class PathEstimator:
         centre = dr.repeat(dr.block_sum(samples, per_stratum) / per_stratum, per_stratum)
         spread = dr.block_sum(dr.square(samples - centre), self.spp)
         variance = spread / (n_strata**2 * per_stratum * (per_stratum - 1))
-        shape = (n_lit, 3, n_texels)
-        return tuple(value.numpy().reshape(shape).transpose(0, 2, 1) for value in (mean, variance))
+        ends = np.cumsum([piece.size // self.spp for piece in pieces])
+        parts = [np.split(value.numpy(), ends[:-1]) for value in (mean, variance)]
+        return [
+            tuple(part.reshape(len(piece.lights), 3, -1).transpose(0, 2, 1) for part in both)
+            for piece, both in zip(pieces, zip(*parts, strict=True), strict=True)
+        ]

@@ -2,18 +2,52 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 
 from btfref.sampling import path_estimator
-from btfref.sampling.path_estimator import PathEstimator, strata
-from btfref.sampling.tiled_scene import START, stream_keys, uniforms
+from btfref.sampling.path_estimator import PathEstimator, Piece, strata
+from btfref.sampling.tiled_scene import START, stream_words, uniforms
 
 #: Random streams of a texel with a number of samples of its own: more than anybody asks of one texel.
 STREAMS = 1 << 16
 
+#: Lights that a lane counts for at least: the state of a path needs memory too, whatever it is connected to.
+LEAST_LIGHTS = 16
+
+
+@dataclass
+class Request:
+    """Texels of one view.
+
+    Attributes
+    ----------
+    view : int
+        Number of the view in the full set.
+    texel : ndarray (K,) of int
+        Numbers of texels, row by row.
+    lights : ndarray of int, or None
+        Indices of the lights that results are of; None for all. Those of a light do not depend on the others.
+    counts : ndarray (K,) of int, or None
+        Samples of each texel, even; the settings' for all when not given.
+    stream : tuple of int
+        Selects other random numbers.
+    tag : Any
+        What the caller wants to remember.
+    """
+
+    view: int
+    texel: np.ndarray
+    lights: np.ndarray | None = None
+    counts: np.ndarray | None = None
+    stream: tuple = ()
+    tag: Any = None
+
 
 class TexelPaths(PathEstimator):
-    """`PathEstimator` that is asked for texels instead of whole views; parameters as there.
+    """Radiance of texels of views, by path tracing with light connections; parameters as of `PathEstimator`.
 
     Parameters
     ----------
@@ -26,66 +60,117 @@ class TexelPaths(PathEstimator):
         self.buffer = buffer
 
     @property
-    def lanes_per_pass(self):
-        """Samples traced together; a bound on memory, without influence on the result."""
+    def samples_per_pass(self):
+        """Pairs of lane and light traced together; a bound on memory, without influence on the result."""
         buffer = min(self.buffer or path_estimator.SAMPLE_BUFFER, path_estimator.SAMPLE_BUFFER)
-        return max(buffer // (12 * max(len(self.lit), 1)), 1)
+        return max(buffer // 12, 1)
 
     def estimate(self, view, texel, counts=None, stream=()):
-        """Mean and variance of the mean of some texels of one view.
-
-        Parameters
-        ----------
-        view : int
-            Number of the view in the full set.
-        texel : ndarray (K,) of int
-            Numbers of texels, row by row.
-        counts : ndarray (K,) of int, optional
-            Samples of each texel, even; `spp` for all when not given.
-        stream : tuple of int
-            Selects other random numbers.
+        """Mean and variance of the mean of some texels of one view for all lights; see `Request`.
 
         Returns
         -------
         mean, variance : ndarray (n_lights, K, 3), float32
             B in 1/sr.
         """
-        mean = np.zeros((self.n_lights, len(texel), 3), np.float32)
-        variance = np.zeros_like(mean)
-        w_view = np.asarray(self.views[view], np.float64)
-        if w_view[2] <= 0 or not len(self.lit) or not len(texel):
-            return mean, variance
-        keys = stream_keys(self.seed, int(view), *stream)
-        own = counts is not None
-        counts = np.full(len(texel), self.spp) if counts is None else np.asarray(counts)
+        ((_, mean, variance),) = self.estimate_all([Request(view, texel, None, counts, stream)])
+        return mean, variance
+
+    def estimate_all(self, requests):
+        """Results of requests in their order; those of few lights share passes.
+
+        Parameters
+        ----------
+        requests : iterable of Request
+            Read as far ahead as one pass reaches.
+
+        Yields
+        ------
+        request, mean, variance : Request, ndarray, ndarray
+            As of `estimate`, of the request's lights.
+        """
+        held, parts, free = [], [], self.samples_per_pass
+        for request in requests:
+            n_lights = len(self.lights) if request.lights is None else len(request.lights)
+            # Mean and variance, to which passes add what they find.
+            results = [np.zeros((n_lights, len(request.texel), 3), np.float32) for _ in range(2)]
+            held.append((request, *results))
+            for texels, cost in self._pieces(request):
+                if parts and (cost > free or request.counts is not None):
+                    self._pass(parts)
+                    parts, free = [], self.samples_per_pass
+                    yield from held[:-1]
+                    del held[:-1]
+                parts.append((request, results, texels))
+                free -= cost
+                if request.counts is not None:
+                    # Sums of as many samples as each texel has: a pass of its own.
+                    self._pass(parts)
+                    parts, free = [], self.samples_per_pass
+            if not parts:
+                yield from held
+                held = []
+        if parts:
+            self._pass(parts)
+        yield from held
+
+    def _lit(self, request):
+        """Which of the request's lights are above the horizon."""
+        vectors = self.lights if request.lights is None else self.lights[request.lights]
+        return np.flatnonzero(vectors[:, 2] > 0)
+
+    def _pieces(self, request):
+        """Places of a request's texels that go together, and what they take of a pass."""
+        n_lit = len(self._lit(request))
+        if self.views[request.view][2] <= 0 or not n_lit or not len(request.texel):
+            return
+        counts = request.counts
+        counts = np.full(len(request.texel), self.spp) if counts is None else np.asarray(counts)
         # Texels of equal counts lie side by side, so that their sums are sums of blocks.
         order = np.argsort(counts, kind="stable")
         ends = np.cumsum(counts[order])
+        each = max(n_lit, LEAST_LIGHTS)
+        lanes = max(self.samples_per_pass // each, 1)
         first = 0
         while first < len(order):
             start = ends[first - 1] if first else 0
-            last = max(np.searchsorted(ends, start + self.lanes_per_pass, side="right"), first + 1)
-            chosen = order[first:last]
-            part = self._pass(texel[chosen], counts[chosen], w_view, keys, own)
-            mean[np.ix_(self.lit, chosen)], variance[np.ix_(self.lit, chosen)] = part
+            last = max(np.searchsorted(ends, start + lanes, side="right"), first + 1)
+            yield order[first:last], int(ends[last - 1] - start) * each
             first = last
-        return mean, variance
 
-    def view(self, index, w_view=None):
-        """Mean and variance of the mean of one view's texels; see `PathEstimator.view`."""
+    def all_views(self, views):
+        """Yield (view, mean, variance) of views: (n_lights, rows, columns, 3) float32, B in 1/sr."""
         n_texels = self.texels[0] * self.texels[1]
         texel = np.arange(n_texels) if self.mask is None else np.flatnonzero(self.mask)
-        full = []
-        for part in self.estimate(index, texel):
-            whole = np.zeros((self.n_lights, n_texels, 3), np.float32)
-            whole[:, texel] = part
-            full.append(whole.reshape(self.n_lights, *self.texels, 3))
-        return tuple(full)
+        for request, *parts in self.estimate_all(Request(int(view), texel) for view in views):
+            full = []
+            for part in parts:
+                whole = np.zeros((len(self.lights), n_texels, 3), np.float32)
+                whole[:, texel] = part
+                full.append(whole.reshape(len(self.lights), *self.texels, 3))
+            yield request.view, *full
 
-    def _pass(self, texel, counts, w_view, keys, own):
-        """Trace all samples of some texels; two (n_lit, texels, 3) arrays."""
+    def _pass(self, parts):
+        """Trace all samples of some requests' texels and write them to their results."""
         import mitsuba as mi
 
+        pieces, texel, counts, stride = [], [], [], []
+        for request, _, place in parts:
+            own = request.counts is not None
+            n = np.asarray(request.counts)[place] if own else np.full(len(place), self.spp)
+            lights = self.lights if request.lights is None else self.lights[request.lights]
+            pieces.append(
+                Piece(
+                    np.asarray(self.views[request.view], np.float64),
+                    stream_words(self.seed, int(request.view), *request.stream),
+                    lights[self._lit(request)],
+                    int(n.sum()),
+                )
+            )
+            texel.append(np.asarray(request.texel)[place])
+            counts.append(n)
+            stride.append(np.full(len(place), STREAMS if own else self.spp, np.uint64))
+        texel, counts, stride = (np.concatenate(a) for a in (texel, counts, stride))
         sample = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
         different, which = np.unique(counts, return_inverse=True)
         split = np.array([strata(int(n)) for n in different], np.uint32)[which]
@@ -94,13 +179,16 @@ class TexelPaths(PathEstimator):
             for values in (texel, split[:, 0], split[:, 1], split[:, 2])
         ]
         self._sample = mi.UInt32(sample.astype(np.uint32))
-        stride = np.uint64(STREAMS if own else self.spp)
-        lane = np.repeat(texel, counts).astype(np.uint64) * stride + sample.astype(np.uint64)
+        lane = np.repeat(texel.astype(np.uint64) * stride, counts) + sample.astype(np.uint64)
         self._lane = mi.UInt32((lane % np.uint64(2**32)).astype(np.uint32))
-        self._paths(len(sample), 0, w_view, keys)
-        return self._sums(counts) if own else self._statistics(len(self.lit), len(counts))
+        self._paths(pieces)
+        own = parts[0][0].counts is not None
+        found = [self._sums(pieces[0], counts)] if own else self._statistics(pieces)
+        for (request, results, place), some in zip(parts, found, strict=True):
+            for result, values in zip(results, some, strict=True):
+                result[np.ix_(self._lit(request), place)] = values
 
-    def _stream(self, lane, first):
+    def _stream(self, lane):
         import drjit as dr
 
         return dr.gather(type(lane), self._lane, lane)
@@ -114,23 +202,23 @@ class TexelPaths(PathEstimator):
         # Idle lanes of a SIMD packet gather 0, and whole numbers divided by 0 end the process.
         columns, rows, per_stratum = (dr.maximum(value, 1) for value in split)
         stratum = dr.gather(mi.UInt32, self._sample, lane) // per_stratum
-        u, v, _, _ = uniforms(self._stream(lane, None), keys, mi.UInt32(0))
+        u, v, _, _ = uniforms(self._stream(lane), keys, mi.UInt32(0))
         u = (mi.Float(stratum % columns) + u) / mi.Float(columns)
         v = (mi.Float(stratum // columns) + v) / mi.Float(rows)
         x = (mi.Float(texel % self.texels[1]) + u) / self.texels[1]
         y = (mi.Float(texel // self.texels[1]) + v) / self.texels[0]
         return dr.fma(mi.Vector3f(w_view), START, mi.Point3f(x, y, 0))
 
-    def _sums(self, counts):
+    def _sums(self, piece, counts):
         """Mean and variance of the mean of blocks of samples; `counts` ascends."""
         import drjit as dr
 
         # Every count is even, so a stratum holds two samples: their sum, and half their difference squared.
-        samples = self._buffer
+        samples, n_lit = self._buffer, len(piece.lights)
         pairs = dr.block_sum(samples, 2)
         spread = 2 * dr.block_sum(dr.square(samples - dr.repeat(pairs / 2, 2)), 2)
-        pairs, spread = (a.numpy().reshape(len(self.lit), 3, -1) for a in (pairs, spread))
-        mean = np.zeros((len(self.lit), 3, len(counts)), np.float32)
+        pairs, spread = (a.numpy().reshape(n_lit, 3, -1) for a in (pairs, spread))
+        mean = np.zeros((n_lit, 3, len(counts)), np.float32)
         variance = np.zeros_like(mean)
         begin = 0
         for n in np.unique(counts):

@@ -161,8 +161,13 @@ def stream_keys(*words):
     import drjit as dr
     import mitsuba as mi
 
+    return [dr.opaque(mi.UInt32, word) for word in stream_words(*words)]
+
+
+def stream_words(*words):
+    """The two words as numbers."""
     state = np.random.SeedSequence([int(word) for word in words]).generate_state(2, np.uint32)
-    return [dr.opaque(mi.UInt32, int(word)) for word in state]
+    return tuple(int(word) for word in state)
 
 
 def rotated(u, v, number):
