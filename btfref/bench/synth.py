@@ -16,7 +16,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
@@ -337,7 +337,8 @@ class _Process:
         self._process.kill()
         self._process.wait()
         for stream in (self._process.stdin, self._process.stdout, self._errors):
-            stream.close()
+            with suppress(BrokenPipeError):  # of a process that failed, which `answer` tells
+                stream.close()
 
     def answer(self, order=None):
         """Send an order, if any, and wait for the answer."""

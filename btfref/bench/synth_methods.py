@@ -206,21 +206,25 @@ class Reference(NaiveLoop):
 
 
 class SharedPaths(_Subject):
-    """`PathEstimator`, its variances left out; its time is that of some views."""
+    """`TexelPaths`, its variances left out; its time is that of some views."""
 
     def __init__(self, mi, job):
         super().__init__(mi, job)
         self.time(0, 2)
 
     def _made(self, lights, seed):
-        from btfref.sampling.path_estimator import PathEstimator
+        from btfref.sampling.texel_paths import TexelPaths
 
-        class Images(PathEstimator):
-            def _statistics(self, n_lit, n_texels):
+        class Images(TexelPaths):
+            def _statistics(self, pieces):
                 import drjit as dr
 
-                mean = dr.block_sum(self._buffer, self.spp) / self.spp
-                return mean.numpy().reshape(n_lit, 3, n_texels).transpose(0, 2, 1), 0
+                mean = (dr.block_sum(self._buffer, self.spp) / self.spp).numpy()
+                ends = np.cumsum([piece.size // self.spp for piece in pieces])[:-1]
+                return [
+                    (part.reshape(len(piece.lights), 3, -1).transpose(0, 2, 1), 0)
+                    for piece, part in zip(pieces, np.split(mean, ends), strict=True)
+                ]
 
         gc.collect()  # the materials of the scene before would make other kernels
         return Images(self.tile, self.vectors[lights], views=self.vectors, seed=seed, **self.settings)
