@@ -130,6 +130,7 @@ def _measured(job, rounds, count, steps):
         processes = {}
         for label, (task, spp, _) in methods(job["mesostructure"]).items():
             processes[label] = stack.enter_context(_Process(job | {"task": task, "spp": spp}))
+            processes[label].answer()  # that it is ready
         for seed in range(max(count.values())):
             for label, (task, spp, _) in methods(job["mesostructure"]).items():
                 if seed >= count[task]:

@@ -8,6 +8,7 @@ from html import escape
 import numpy as np
 
 from btfref.compare.png import encode_png
+from btfref.report import svg
 
 #: Decades of relative error that the histogram shows; smaller ones, and zero, fall into its first bin.
 DECADES = (-8, 1)
@@ -80,32 +81,28 @@ def error_histogram(relative, classes, marks):
     def y(log):
         return _TOP + (0 - log) / (0 - floor) * (_HEIGHT - _TOP - _BOTTOM)
 
-    parts = []
+    lines, below, beside = [], [], []
     for decade in range(low, high + 1):
-        label = "≤ 10⁻⁸" if decade == low else _power(decade)
-        parts.append(_line("grid", x(decade), _TOP, x(decade), y(floor)))
-        parts.append(_text(x(decade), y(floor) + 15, label, "middle"))
+        lines.append((x(decade), _TOP, x(decade), y(floor)))
+        below.append((x(decade), y(floor) + 15, "≤ 10⁻⁸" if decade == low else _power(decade)))
     for decade, label in ((0, "100 %"), (-1, "10 %"), (-2, "1 %"), (-3, "0.1 %"), (-4, "10⁻⁴"), (-5, "10⁻⁵")):
-        parts.append(_line("grid", _LEFT, y(decade), _WIDTH - _RIGHT, y(decade)))
-        parts.append(_text(_LEFT - 6, y(decade) + 3.5, label, "end"))
+        lines.append((_LEFT, y(decade), _WIDTH - _RIGHT, y(decade)))
+        beside.append((_LEFT - 6, y(decade) + 3.5, label))
+    parts = [svg.lines("grid", lines), svg.texts("tick", "middle", below), svg.texts("tick", "end", beside)]
     for name, share in series:
-        steps = [f"M{x(edges[0]):.1f} {y(floor):.1f}"]
-        for left, right, value in zip(edges[:-1], edges[1:], share, strict=True):
-            top = y(max(np.log10(value), floor)) if value > 0 else y(floor)
-            steps.append(f"L{x(left):.1f} {top:.1f}L{x(right):.1f} {top:.1f}")
-        steps.append(f"L{x(edges[-1]):.1f} {y(floor):.1f}Z")
-        parts.append(f'<path class="series {name}" d="{"".join(steps)}"/>')
+        heights = [y(max(np.log10(v), floor)) if v > 0 else y(floor) for v in share]
+        parts.append(svg.steps(f"series {name}", [x(edge) for edge in edges], heights, y(floor)))
     for index, (label, value) in enumerate(marks):
         if 10.0**low < value < 10.0**high:
             at = x(np.log10(value))
-            parts.append(_line("mark", at, _TOP - 4, at, y(floor)))
-            parts.append(_text(at + 4, _TOP - 6 + 12 * (index % 2), label, "start", "marklabel"))
+            parts.append(svg.lines("mark", [(at, _TOP - 4, at, y(floor))]))
+            parts.append(svg.text(at + 4, _TOP - 6 + 12 * (index % 2), label, "start", "marklabel"))
     legend_x = _LEFT + 4
     for name, _ in series:
-        parts.append(f'<rect class="key {name}" x="{legend_x}" y="6" width="10" height="10"/>')
-        parts.append(_text(legend_x + 15, 15, name, "start"))
+        parts.append(f'<rect class="key {name}" x="{svg.short(legend_x)}" y="6" width="10" height="10"/>')
+        parts.append(svg.text(legend_x + 15, 15, name, "start"))
         legend_x += 26 + 6.4 * len(name)
-    parts.append(_text((_LEFT + _WIDTH) / 2, _HEIGHT - 5, "relative error of a pixel", "middle", "axis"))
+    parts.append(svg.text((_LEFT + _WIDTH) / 2, _HEIGHT - 5, "relative error of a pixel", "middle", "axis"))
     return _svg(parts, "Share of pixels over relative error, by pixel class")
 
 
@@ -127,34 +124,25 @@ def p_value_histogram(p_values):
     tallest = max(2.0, float(density.max()))
     inner_w, inner_h = _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM
     base = _TOP + inner_h
-    parts = []
-    for k, value in enumerate(density):
-        height = value / tallest * inner_h
-        parts.append(
-            f'<rect class="bar" x="{_LEFT + k * inner_w / 20 + 1:.1f}" y="{base - height:.1f}" '
-            f'width="{inner_w / 20 - 2:.1f}" height="{height:.1f}"/>'
-        )
+    step = inner_w / 20
+    bars = [(_LEFT + k * step + 1, base - v / tallest * inner_h, step - 2) for k, v in enumerate(density)]
     flat = base - inner_h / tallest
-    parts.append(_line("mark", _LEFT, flat, _WIDTH - _RIGHT, flat))
-    parts.append(_text(_WIDTH - _RIGHT, flat - 5, "expected of noise alone", "end", "marklabel"))
-    for tick in (0, 0.25, 0.5, 0.75, 1):
-        parts.append(_text(_LEFT + tick * inner_w, base + 15, f"{tick:g}", "middle"))
-    for tick in (0.0, 1.0, tallest):
-        parts.append(_text(_LEFT - 6, base - tick / tallest * inner_h + 3.5, f"{tick:.3g}", "end"))
-    parts.append(_text((_LEFT + _WIDTH) / 2, _HEIGHT - 5, "p-value of a pixel's channel", "middle", "axis"))
+    parts = [
+        svg.bars("bar", bars, base),
+        svg.lines("mark", [(_LEFT, flat, _WIDTH - _RIGHT, flat)]),
+        svg.text(_WIDTH - _RIGHT, flat - 5, "expected of noise alone", "end", "marklabel"),
+    ]
+    below = [(_LEFT + tick * inner_w, base + 15, f"{tick:g}") for tick in (0, 0.25, 0.5, 0.75, 1)]
+    beside = [(_LEFT - 6, base - t / tallest * inner_h + 3.5, f"{t:.3g}") for t in (0.0, 1.0, tallest)]
+    parts += [svg.texts("tick", "middle", below), svg.texts("tick", "end", beside)]
+    parts.append(
+        svg.text((_LEFT + _WIDTH) / 2, _HEIGHT - 5, "p-value of a pixel's channel", "middle", "axis")
+    )
     return _svg(parts, "Density of p-values")
 
 
 def _power(exponent):
     return "10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")) if exponent else "1"
-
-
-def _line(kind, x1, y1, x2, y2):
-    return f'<line class="{kind}" x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"/>'
-
-
-def _text(x, y, text, anchor, kind="tick"):
-    return f'<text class="{kind}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
 
 
 def _svg(parts, label):

@@ -62,7 +62,8 @@ def write_validation(folder, result, *, self_test=None, progress=None):
         thumbnails[cell.facts["name"]] = _cell_page(folder, result, done)
     report(len(result.cells), len(result.cells), "writing pages")
     _index(folder, result, self_test, thumbnails)
-    text = json.dumps(result.to_dict(), indent=1, allow_nan=False)
+    # Seven digits are what float32 pictures give.
+    text = json.dumps(_rounded(result.to_dict()), separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     (folder / "validation.json").write_text(text + "\n", "utf-8")
     return folder / "index.html"
 
@@ -71,6 +72,15 @@ def slug(facts):
     """Name of a cell's page."""
     words = (facts["mesostructure"], facts["method"], facts["scene"], facts["lights"])
     return "-".join("".join(c if c.isalnum() or c in "_." else "_" for c in Path(str(w)).stem) for w in words)
+
+
+def _rounded(value, digits=7):
+    """JSON-able data whose floats have so many digits."""
+    if isinstance(value, float):
+        return float(f"{value:.{digits}g}")
+    if isinstance(value, dict):
+        return {name: _rounded(inner, digits) for name, inner in value.items()}
+    return [_rounded(inner, digits) for inner in value] if isinstance(value, list | tuple) else value
 
 
 def _view(facts):
@@ -107,9 +117,9 @@ def _cell_page(folder, result, index):
     comparison = made.comparison()
     own = {gate.name for gate in comparison.gates} if comparison else set()
     images = {name: made.images[name] for name in sorted(made.images, key=lambda n: n != "reference")}
-    cell = Cell(
-        facts["name"], images, comparison, facts["notes"], tuple(g for g in made.gates if g.name not in own)
-    )
+    # The waterfall says it below.
+    notes = facts["notes"].removeprefix((facts["waterfall"] or {}).get("explanation", "")).strip()
+    cell = Cell(facts["name"], images, comparison, notes, tuple(g for g in made.gates if g.name not in own))
     body = article(
         index + 1, cell, extra=waterfall_section(facts["waterfall"]), images=_packed(images), bits=MAP_BITS
     )
@@ -128,7 +138,7 @@ def _cell_page(folder, result, index):
         scripts=f'{shared}<script src="../assets/report.js"></script>',
     )
     (folder / "cells" / f"{slug(facts)}.html").write_text(page, "utf-8")
-    return thumbnail(cell.display.encoded(images["reference"]), size=48) if images else ""
+    return thumbnail(cell.display.encoded(images["reference"]), size=32) if images else ""
 
 
 def _page(**slots):
@@ -232,14 +242,15 @@ def _entry(cell, peaks, thumbnails):
     facts = cell.facts
     numbers = {name: show(facts) for name, show in SHOWN.items()}
     sign = {"pass": "✓", "fail": "✗", "inconclusive": "?"}[cell.outcome]
-    values = {name: sign if name == "outcome" else number(v, 2) for name, v in numbers.items()}
-    shades = {
-        name: round(55 * v / peaks[name]) if v is not None and peaks[name] else 0
+    # In the order of the choice above the matrix.
+    values = [sign if name == "outcome" else number(v, 2) for name, v in numbers.items()]
+    shades = [
+        str(round(55 * v / peaks[name]) if v is not None and peaks[name] else 0)
         for name, v in numbers.items()
-    }
+    ]
     picture = thumbnails.get(facts["name"])
     image = f'<img src="{picture}" alt="" width="38" height="38" loading="lazy">' if picture else ""
-    data = {"values": json.dumps(values), "shades": json.dumps(shades)}
+    data = {"values": "|".join(values), "shades": "|".join(shades)}
     attributes = " ".join(f'data-{name}="{escape(text)}"' for name, text in data.items())
     link = f'<a href="cells/{slug(facts)}.html" title="{escape(facts["name"])}">'
     return f'<td class="{cell.outcome}" {attributes}>{link}{image}<span class="value">{sign}</span></a></td>'

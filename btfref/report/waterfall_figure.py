@@ -6,6 +6,7 @@ from html import escape
 
 import numpy as np
 
+from btfref.report import svg
 from btfref.report.text import number
 
 _WIDTH, _LEFT, _RIGHT, _TOP, _ROW = 760, 108, 132, 30, 34
@@ -45,29 +46,29 @@ def waterfall_figure(fall):
         log = np.log10(value) if value > 0 else low
         return _LEFT + (np.clip(log, low, top) - low) / (top - low) * (_WIDTH - _LEFT - _RIGHT)
 
-    parts = []
-    for decade in range(int(low), int(top) + 1):
-        at = x(10.0**decade)
-        parts.append(f'<line class="grid" x1="{at:.1f}" y1="{_TOP}" x2="{at:.1f}" y2="{base}"/>')
-        parts.append(_text(at, base + 15, f"1e{decade}".replace("-", "−"), "middle"))
+    decades = [(x(10.0**k), f"1e{k}".replace("-", "−")) for k in range(int(low), int(top) + 1)]
+    parts = [
+        svg.lines("grid", [(at, _TOP, at, base) for at, _ in decades]),
+        svg.texts("tick", "middle", [(at, base + 15, words) for at, words in decades]),
+    ]
     for row, (name, stage) in enumerate(rows):
         y = _TOP + _ROW * row
-        parts.append(_text(_LEFT - 8, y + 17, name, "end", "axis"))
+        parts.append(svg.text(_LEFT - 8, y + 17, name, "end", "axis"))
         parts.append(_bar(x, stage["rmse"], y + 4, 12, "series interior", low))
         if "rmse_so_far" in stage:
             parts.append(_bar(x, stage["rmse_so_far"], y + 18, 8, "series silhouette", low))
         text = f"{number(stage['rmse']['estimate'])}, ΔE00 {number(stage['delta_e00']['estimate'], 2)}"
-        parts.append(_text(_WIDTH - _RIGHT + 8, y + 17, text, "start"))
+        parts.append(svg.text(_WIDTH - _RIGHT + 8, y + 17, text, "start"))
     y = _TOP + _ROW * len(rows)
-    parts.append(_text(_LEFT - 8, y + 17, "covariances", "end", "axis"))
+    parts.append(svg.text(_LEFT - 8, y + 17, "covariances", "end", "axis"))
     parts.append(_bar(x, _magnitude(fall["covariance"]), y + 4, 12, "series mesostructure", low))
-    parts.append(_text(_WIDTH - _RIGHT + 8, y + 17, _signed_root(fall["covariance"]["estimate"]), "start"))
+    parts.append(svg.text(_WIDTH - _RIGHT + 8, y + 17, _signed_root(fall["covariance"]["estimate"]), "start"))
     y += _ROW
-    parts.append(_text(_LEFT - 8, y + 17, "whole", "end", "axis"))
+    parts.append(svg.text(_LEFT - 8, y + 17, "whole", "end", "axis"))
     parts.append(_bar(x, fall["total"], y + 6, 14, "series silhouette", low))
     colour = stages[-1]["delta_e00_so_far"]["estimate"]
     text = f"{number(fall['total']['estimate'])}, ΔE00 {number(colour, 2)}"
-    parts.append(_text(_WIDTH - _RIGHT + 8, y + 17, text, "start"))
+    parts.append(svg.text(_WIDTH - _RIGHT + 8, y + 17, text, "start"))
     keys = (
         ("interior", "alone"),
         ("silhouette", "so far, against the truth"),
@@ -75,8 +76,8 @@ def waterfall_figure(fall):
     )
     for at, (kind, text) in zip((0, 70, 235), keys, strict=True):
         parts.append(f'<rect class="key {kind}" x="{_LEFT + at}" y="8" width="10" height="10"/>')
-        parts.append(_text(_LEFT + at + 15, 17, text, "start"))
-    parts.append(_text((_LEFT + _WIDTH - _RIGHT) / 2, height - 2, "RMSE of radiance", "middle", "axis"))
+        parts.append(svg.text(_LEFT + at + 15, 17, text, "start"))
+    parts.append(svg.text((_LEFT + _WIDTH - _RIGHT) / 2, height - 2, "RMSE of radiance", "middle", "axis"))
     return (
         f'<svg class="chart waterfall" viewBox="0 0 {_WIDTH} {height}" role="img" '
         f'aria-label="Errors of the stages">{"".join(parts)}</svg>'
@@ -102,12 +103,13 @@ def _bar(x, interval, y, height, kind, low):
     start, end = x(10.0**low), x(interval["estimate"])
     ends = [x(interval[name]) for name in ("low", "high")]
     middle = y + height / 2
-    bar = f'<rect class="{kind}" x="{start:.1f}" y="{y}" width="{max(end - start, 0.5):.1f}" height="{height}"/>'
+    width = svg.short(max(end - start, 0.5))
+    bar = f'<rect class="{kind}" x="{svg.short(start)}" y="{y}" width="{width}" height="{height}"/>'
     if ends[1] - ends[0] < 0.5:
         return bar
     return bar + (
-        f'<path class="whisker" d="M{ends[0]:.1f} {middle}H{ends[1]:.1f}M{ends[0]:.1f} {middle - 4}v8'
-        f'M{ends[1]:.1f} {middle - 4}v8"/>'
+        f'<path class="whisker" d="M{svg.short(ends[0])} {svg.short(middle - 4)}v8m0 -4H{svg.short(ends[1])}'
+        f'm0 -4v8"/>'
     )
 
 
@@ -176,7 +178,3 @@ def waterfall_section(fall):
         f'<div class="chartbox">{waterfall_figure(fall)}</div>{waterfall_table(fall)}'
         f'<p class="notes">{escape(fall["explanation"] + apart)} {mean} {intervals}</p></section>'
     )
-
-
-def _text(x, y, text, anchor, kind="tick"):
-    return f'<text class="{kind}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'

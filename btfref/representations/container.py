@@ -206,24 +206,22 @@ def bytes_of_choice(path, choice):
 def _read_some(path, manifest, choice, bytes_read=None):
     """The maps with the rows that a choice needs, or None where reading the whole file takes no longer."""
     kind = method(manifest["meta"]["method"], file=path).representation
-    plans, needed, whole = {}, 0, 0
-    for entry in manifest["arrays"].values():
-        whole += int(np.prod(entry["shape"], dtype=np.int64)) * np.dtype(entry["dtype"]).itemsize
-    for name, axes in needed_rows(kind, manifest, choice).items():
-        entry = manifest["arrays"][name]
-        rows, share = rows_of(entry, axes), 1.0
-        height, _ = image_size(file_shape(entry), len(entry.get("rows", ())))
-        if rows is not None:
-            share = len(rows) / height
-        plans[name] = rows
-        needed += share * int(np.prod(entry["shape"], dtype=np.int64)) * np.dtype(entry["dtype"]).itemsize
-    if needed > WORTH * whole:
+    sizes = {
+        name: int(np.prod(entry["shape"], dtype=np.int64)) * np.dtype(entry["dtype"]).itemsize
+        for name, entry in manifest["arrays"].items()
+    }
+    wanted = needed_rows(kind, manifest, choice)
+    plans = {name: rows_of(manifest["arrays"][name], axes) for name, axes in wanted.items()}
+    # Rows alone may settle it, before the file's headers are read.
+    if sum(sizes[name] for name, rows in plans.items() if rows is None) > WORTH * sum(sizes.values()):
         return None
     arrays = {}
     with RowReader(path) as reader:
+        if not all(reader.knows(name) for name in plans):
+            return None
+        if sum(sizes[name] * reader.share(name, plans[name]) for name in plans) > WORTH * sum(sizes.values()):
+            return None
         for name, rows in plans.items():
-            if not reader.knows(name):
-                return None
             entry = manifest["arrays"][name]
             pixels = reader.read(name, channel_names(entry["shape"][-1]), rows)
             arrays[name] = _read_map(path, name, entry, pixels, manifest)

@@ -81,6 +81,11 @@ class RowReader:
         part = self._parts.get(name)
         return part is not None and part.compression in LINES and part.kind is not None
 
+    def share(self, name, rows=None):
+        """Share of a part's chunks that hold some rows: what :meth:`read` reads of it."""
+        part = self._parts[name]
+        return 1.0 if rows is None else len(np.unique(np.asarray(rows) // part.lines)) / part.chunks
+
     def read(self, name, channels, rows=None):
         """Pixels of a part.
 

@@ -6,9 +6,9 @@
   if (!table) return;
   function refresh() {
     for (const cell of table.querySelectorAll("td[data-values]")) {
-      cell.querySelector(".value").textContent = JSON.parse(cell.dataset.values)[value.value] ?? "–";
-      const shade = JSON.parse(cell.dataset.shades)[value.value];
-      cell.style.setProperty("--shade", shade ?? 0);
+      // One each per option, in their order.
+      cell.querySelector(".value").textContent = cell.dataset.values.split("|")[value.selectedIndex];
+      cell.style.setProperty("--shade", cell.dataset.shades.split("|")[value.selectedIndex]);
     }
     table.dataset.shaded = String(value.value !== "outcome");
     for (const row of table.querySelectorAll("tbody tr"))
