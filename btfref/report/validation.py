@@ -9,7 +9,7 @@ from pathlib import Path
 
 from btfref.report.cell import Cell, asset, script_json
 from btfref.report.figures import thumbnail
-from btfref.report.pack import pack
+from btfref.report.pack import pack, pack_text
 from btfref.report.pareto import Panel, Point, pareto_svg
 from btfref.report.stage import article
 from btfref.report.text import badge, facts_list, gate_list, number
@@ -62,7 +62,7 @@ def write_validation(folder, result, *, self_test=None, progress=None):
         thumbnails[cell.facts["name"]] = _cell_page(folder, result, done)
     report(len(result.cells), len(result.cells), "writing pages")
     _index(folder, result, self_test, thumbnails)
-    # Seven digits are what float32 pictures give.
+    # More than six digits no picture of float32 gives.
     text = json.dumps(_rounded(result.to_dict()), separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     (folder / "validation.json").write_text(text + "\n", "utf-8")
     return folder / "index.html"
@@ -74,7 +74,7 @@ def slug(facts):
     return "-".join("".join(c if c.isalnum() or c in "_." else "_" for c in Path(str(w)).stem) for w in words)
 
 
-def _rounded(value, digits=7):
+def _rounded(value, digits=6):
     """JSON-able data whose floats have so many digits."""
     if isinstance(value, float):
         return float(f"{value:.{digits}g}")
@@ -124,6 +124,7 @@ def _cell_page(folder, result, index):
         index + 1, cell, extra=waterfall_section(facts["waterfall"]), images=_packed(images), bits=MAP_BITS
     )
     body = body.replace('href="#overview"', 'href="../index.html"')
+    body = f'<script type="text/plain" id="packed">{pack_text(body)}</script>'
     names = [c.facts for c in result.cells]
     around = [("← previous", index - 1), ("next →", index + 1)]
     links = [f'<a href="{slug(names[k])}.html">{word}</a>' for word, k in around if 0 <= k < len(names)]
@@ -134,11 +135,12 @@ def _cell_page(folder, result, index):
         verdict="",
         root="../",
         nav="".join(['<a href="../index.html">Overview</a>', *links]),
+        noscript="This page needs JavaScript; the overview does not.",
         main=body,
         scripts=f'{shared}<script src="../assets/report.js"></script>',
     )
     (folder / "cells" / f"{slug(facts)}.html").write_text(page, "utf-8")
-    return thumbnail(cell.display.encoded(images["reference"]), size=32) if images else ""
+    return thumbnail(cell.display.encoded(images["reference"]), size=28) if images else ""
 
 
 def _page(**slots):
@@ -176,6 +178,7 @@ def _index(folder, result, self_test, thumbnails):
         heading="Validation",
         verdict=f'<p class="verdict {kind}"><strong>{word}</strong><span>{counts}</span></p>',
         root="",
+        noscript="Without JavaScript the tables and figures are complete; the choice of numbers needs it.",
         nav="".join(f'<a href="#{key}">{title}</a>' for key, title, _ in sections)
         + '<a href="validation.json">JSON</a>',
         main="".join(

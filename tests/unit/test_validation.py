@@ -14,7 +14,7 @@ from btfref.compare.colour import Display
 from btfref.compare.waterfall import Picture, waterfall
 from btfref.errors import InputError
 from btfref.registry import methods
-from btfref.report.pack import pack, unpack
+from btfref.report.pack import pack, unpack, unpack_text
 from btfref.report.validation import write_validation
 from btfref.validate import cache as caching
 from btfref.validate.cache import Cache, code_of, method_files
@@ -251,6 +251,10 @@ def test_the_report_works_from_disk(result, tmp_path, need, width):
     assert data["kind"] == "validation"
     assert data["passed"] is True
     text = "".join(page.read_text("utf-8") for page in pages)
+    cells = [unpack_text(packed) for packed in re.findall(r'id="packed">([^<]+)<', text)]
+    assert len(cells) == 2
+    text += "".join(cells)
+    assert "Where the error comes from" in text
     assert not re.search(r'(src|href)="https?:', text)
 
 

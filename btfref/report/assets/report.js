@@ -27,10 +27,13 @@
   }
   // Pictures that several pages show stand in a script of their own.
   const whole = (packed) => (packed.shared ? globalThis.sharedPictures[packed.shared] : packed);
-  async function unpack(packed, base) {
-    const raw = Uint8Array.from(atob(packed.data), (c) => c.charCodeAt(0));
+  async function inflate(text) {
+    const raw = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
     const stream = new Blob([raw]).stream().pipeThrough(new DecompressionStream("deflate"));
-    const bytes = new Uint8Array(await new Response(stream).arrayBuffer());
+    return new Response(stream).arrayBuffer();
+  }
+  async function unpack(packed, base) {
+    const bytes = new Uint8Array(await inflate(packed.data));
     const { width, height, channels } = packed, n = width * height, table = halfTable();
     const values = new Float32Array(n * channels), codes = new Uint16Array(n * channels);
     for (let c = 0, i = 0; c < channels; c++)
@@ -319,6 +322,8 @@
   });
   (async () => {
     let built = 0;
+    const packed = document.getElementById("packed"); // the whole page, of which a report has hundreds
+    if (packed) packed.outerHTML = new TextDecoder().decode(await inflate(packed.textContent));
     for (const stage of document.querySelectorAll(".stage")) { await build(stage); built += 1; }
     root.dataset.ready = String(built); // for those who print or test the page
   })().catch((error) => { root.dataset.failed = String(error); throw error; });
