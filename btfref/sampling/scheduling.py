@@ -108,7 +108,7 @@ def _client(scheduler, workers, memory):
                 n_workers=count,
                 threads_per_worker=1,
                 processes=True,
-                dashboard_address=None,
+                dashboard_address="127.0.0.1:0",  # any free port: clusters may stand side by side
                 memory_limit=0,  # the budget is kept by what is made together, not by killing
                 silence_logs=logging.CRITICAL,
             ) as cluster,

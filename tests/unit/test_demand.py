@@ -212,6 +212,7 @@ def test_a_store_of_what_is_needed(need, tmp_path, one_light, settings, whole):
         load(paths["part"]).evaluate([0.2, 0.3], spherical(1.2, 3.0), spherical(1.2, 3.0))
 
 
+@pytest.mark.long
 def test_pairs_of_a_sphere(need, tmp_path, settings, whole):
     """A sphere shows all views and most lights under one light, but few of their pairs: those alone are traced."""
     need("llvm")
