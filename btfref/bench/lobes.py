@@ -6,14 +6,18 @@ called, without.
 
 from __future__ import annotations
 
+import statistics
 import time
 
 import numpy as np
 
-from btfref.bench.timing import machine
+from btfref.bench.timing import interleaved, machine
 from btfref.numerics.threads import one_blas_thread
 
 LOBES = 2
+
+#: Rounds in which the solvers take turns, after one that warms up.
+ROUNDS = 5
 
 #: Ways to call SciPy's optimizer: name in tables, and whether it gets the Jacobian.
 PEERS = {
@@ -38,7 +42,8 @@ def run(*, quick=False, progress=None, btf=None, only=None):
     Returns
     -------
     dict
-        ``raw``: seconds; ``summary``: for each solver the seconds a fit takes, and the mean root-mean-square and mean
+        ``raw``: seconds of every round; ``summary``: for each solver the median of the seconds a fit takes, that of the
+        paired ratios to the batched solver with the least and the largest, and the mean root-mean-square and mean
         absolute residual over the same random fits, times π; ``parameters``; ``machine``.
     """
     from btfref.bench.data import checker
@@ -50,37 +55,45 @@ def run(*, quick=False, progress=None, btf=None, only=None):
     start = time.perf_counter()
     whole = rf_lobes.fit(btf).meta["fit"]
     raw = {"whole fit": time.perf_counter() - start}
-    start = time.perf_counter()
-    result = rf_lobes.fit_lobes(data, btf.lights, LOBES)
-    raw["batched"] = time.perf_counter() - start
-
     chosen = np.sort(np.random.default_rng(0).choice(len(data), 8 if quick else 64, replace=False))
     some = data[chosen].astype(float)
     starts = rf_lobes.lobe_starts(data[chosen], lights, LOBES).astype(float)
     lower, upper = (bound.astype(float) for bound in rf_lobes.lobe_bounds(data[chosen], btf.lights, LOBES))
-    found = {"batched": result.parameters[chosen].astype(float)}
-    for short, (name, jacobian) in PEERS.items():
-        if only is not None and short not in only:
-            continue
-        # Threads would slow such small algebra down, and the first fit imports SciPy: neither is a fair peer.
-        with one_blas_thread():
-            scipy_fit(some[0], lights, starts[0], lower[0], upper[0], jacobian)
-            start = time.perf_counter()
-            fits = [
-                scipy_fit(some[i], lights, starts[i], lower[i], upper[i], jacobian)
-                for i in range(len(chosen))
-            ]
-            raw[name] = time.perf_counter() - start
-        found[name] = np.stack(fits)
-    own = raw["batched"] / len(data)
-    summary = {}
+    found = {}
+
+    def batched():
+        found["result"] = rf_lobes.fit_lobes(data, btf.lights, LOBES)
+
+    def peer(name, jacobian):
+        def task():
+            # Threads would slow such small algebra down, which is no fair peer.
+            with one_blas_thread():
+                found[name] = np.stack(
+                    [
+                        scipy_fit(some[i], lights, starts[i], lower[i], upper[i], jacobian)
+                        for i in range(len(chosen))
+                    ]
+                )
+
+        return task
+
+    wanted = {name: gets for short, (name, gets) in PEERS.items() if only is None or short in only}
+    tasks = {"batched": batched} | {name: peer(name, gets) for name, gets in wanted.items()}
+    raw |= interleaved(tasks, 1 if quick else ROUNDS)
+    result = found.pop("result")
+    found = {"batched": result.parameters[chosen].astype(float), **found}
+    own = [seconds / len(data) for seconds in raw["batched"]]
+    of_solvers = {}
     for name, parameters in found.items():
         model = np.stack([lobes_and_jacobian(p, lights)[0] for p in parameters])
         residual = np.pi * (model - some)
-        seconds = own if name == "batched" else raw[name] / len(chosen)
-        summary[name] = {
-            "seconds_per_fit": seconds,
-            "ratio": seconds / own,
+        seconds = own if name == "batched" else [t / len(chosen) for t in raw[name]]
+        ratios = [a / b for a, b in zip(seconds, own, strict=True)]
+        of_solvers[name] = {
+            "seconds_per_fit": statistics.median(seconds),
+            "ratio": statistics.median(ratios),
+            "ratio_min": min(ratios),
+            "ratio_max": max(ratios),
             "mean_rms": float(np.sqrt((residual**2).mean(1)).mean()),
             "mean_absolute": float(np.abs(residual).mean()),
         }
@@ -89,7 +102,7 @@ def run(*, quick=False, progress=None, btf=None, only=None):
         "suite": "lobes",
         "parameters": parameters | result.summary,
         "raw": raw,
-        "summary": summary,
+        "summary": of_solvers,
         "whole": whole,
         "machine": machine(),
     }
@@ -146,7 +159,7 @@ def table(result):
         (
             name,
             f"{1e6 * s['seconds_per_fit']:.1f} µs",
-            f"{s['ratio']:.0f}",
+            f"{s['ratio']:.0f} ({s['ratio_min']:.0f} … {s['ratio_max']:.0f})",
             f"{s['mean_rms']:.6f}",
             f"{s['mean_absolute']:.6f}",
         )
