@@ -40,7 +40,8 @@ def test_quick_synthesis(need, llvm, capsys):
     assert sphere["views"] > 0.9 * whole["views"]
     assert plane["pairs"] < sphere["pairs"] < whole["pairs"]
     assert whole["share_of_samples"] == whole["share_of_bytes"] == 1
-    assert found["law"]["pair_s"] > 0
+    # What the times are is no test's business.
+    assert all(found["law"][name] >= 0 for name in ("constant_s", "view_s", "pair_s"))
 
 
 def test_quick_scenes(need, fits):
