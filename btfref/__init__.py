@@ -1,14 +1,14 @@
 """Bidirectional texture functions: synthesis, compression, reference and real-time rendering, comparison.
 
 The stages are sub-packages along the data flow: ``mesostructure``, ``sampling``, ``representations``,
-``render``, ``compare``, ``report``. What one uses most is here; `btfref.render.reference.render`,
-`btfref.render.realtime.realtime` and `btfref.compare.compare` stand where they belong. Importing btfref loads
-nothing but the standard library; each stage brings in what it needs when it is used.
+``render``, ``compare``, ``report``. What one uses most is here; `btfref.rendering.offline.reference.render`,
+`btfref.rendering.gl.renderer.realtime` and `btfref.comparison.comparison.compare` stand where they belong. Importing
+btfref loads nothing but the standard library; each stage brings in what it needs when it is used.
 """
 
 from __future__ import annotations
 
-from btfref.versions import __version__
+from btfref.provenance import __version__
 
 __all__ = ["__version__", "fit", "load", "save", "synthesize"]
 
@@ -42,7 +42,7 @@ def load(path):
         from btfref.sampling import SampledBTF
 
         return SampledBTF.load(path)
-    from btfref.representations.container import load as read
+    from btfref.representations.file.container import load as read
 
     return read(path)
 
@@ -77,7 +77,7 @@ def fit(method, btf, *, seed=0, progress=None, **parameters):
 
 
 def save(representation, path):
-    """Write a representation as one OpenEXR file: `btfref.representations.container.save`."""
-    from btfref.representations.container import save as write
+    """Write a representation as one OpenEXR file: `btfref.representations.file.container.save`."""
+    from btfref.representations.file.container import save as write
 
     write(representation, path)

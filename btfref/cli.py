@@ -13,7 +13,7 @@ import sys
 
 from btfref.commands import COMMANDS
 from btfref.errors import BtfrefError
-from btfref.versions import __version__
+from btfref.provenance import __version__
 
 DESCRIPTION = """\
 Bidirectional texture functions from geometry to pixels: synthesize or import a BTF, compress it, render the

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.numerics.precision import real
+from btfref.precision import real
 
 #: Version of the file schemas; readers refuse a newer one.
 SCHEMA_VERSION = 1
@@ -84,7 +84,7 @@ def malformed(uv, w_light, w_view):
     dict of str to int
         ``directions``: lookups with a vector that is not finite or clearly not of unit length; their value is 0.
         ``coordinates``: lookups with ``uv`` that is not finite; it counts as 0. Ports count alike:
-        `mitsuba_plugins.lookup.malformed`, ``shaders/lib/malformed.glsl``.
+        `mitsuba_plugins.lib.lookup.malformed`, ``shaders/lib/lookup/malformed.glsl``.
     """
     low, high = SQUARED_LENGTHS
     unit = True

@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from btfref.scenes import scene_file
+from btfref.scene.shipped import scene_file
 
 SCENES = ("plane", "sphere", "cloth")
 LIGHTS = {
@@ -19,7 +19,7 @@ LIGHTS = {
 #: What is fitted. The first is rendered in every scene under all lights, the others once, on the sphere.
 METHODS = ("lpca", "svd", "raw")
 
-#: The scene that `btfref.render.geometry` can replace by the mesostructure itself.
+#: The scene that `btfref.rendering.offline.geometry` can replace by the mesostructure itself.
 FLAT = "plane"
 
 #: 64 × 64 texels and 81 × 81 directions; 16 paths leave a noise that the eye finds and the gates do not mind,
@@ -39,7 +39,7 @@ GRID = 4
 #: Paths per pixel of the geometry truth, and its seed (not the synthesis's: their noise must be independent).
 GEOMETRY = {"spp": 64, "seed": 1}
 
-#: What the two renderers are judged by; the reasons are in ``btfref/compare/tolerances.toml``.
+#: What the two renderers are judged by; the reasons are in ``btfref/gates/tolerances.toml``.
 GATES = ("image.noise_free", "image.silhouette", "image.background")
 
 
@@ -80,7 +80,7 @@ def demo(output="output/demo", *, progress=None):
     -------
     DemoResult
     """
-    from btfref.compare import save_image
+    from btfref.images import save_image
     from btfref.report import write_report
 
     chain = _Chain(Path(output), progress or (lambda done, total, label: None))
@@ -154,7 +154,7 @@ class _Chain:
     def make_material(self):
         """Sampled BTF and representations."""
         from btfref.registry import method
-        from btfref.representations.container import save
+        from btfref.representations.file.container import save
         from btfref.sampling.synthesis import synthesize
 
         with self.timed("synthesis"):
@@ -172,8 +172,8 @@ class _Chain:
 
     def reference(self, method, scene, lights):
         """The noise-free reference, and the pixel classes of the scene."""
-        from btfref.render.classes import pixel_classes
-        from btfref.render.reference import render
+        from btfref.rendering.offline.reference import render
+        from btfref.scene.pixel_classes import pixel_classes
 
         path, parameters = self.arguments(method, scene, lights)
         with self.timed("reference"):
@@ -185,7 +185,7 @@ class _Chain:
 
     def truth(self, lights):
         """The mesostructure itself, path traced, and the pixels where it may be compared."""
-        from btfref.render.geometry import geometry_classes, render_geometry
+        from btfref.rendering.offline.geometry import geometry_classes, render_geometry
 
         if lights not in self.truths:
             path, parameters = self.arguments(METHODS[0], FLAT, lights)
@@ -197,8 +197,8 @@ class _Chain:
 
     def renderers_cell(self, method, scene, lights):
         """Real-time image against the reference, both reading one file and one scene."""
-        from btfref.compare import compare
-        from btfref.render.realtime import realtime
+        from btfref.comparison import compare
+        from btfref.rendering.gl.renderer import realtime
         from btfref.report import Cell
 
         reference = self.reference(method, scene, lights)
@@ -216,7 +216,7 @@ class _Chain:
 
     def geometry_cell(self, method, lights):
         """A representation on the plane against the path-traced mesostructure."""
-        from btfref.compare import compare
+        from btfref.comparison import compare
         from btfref.report import Cell
 
         truth, classes = self.truth(lights)
@@ -235,7 +235,7 @@ class _Chain:
 
     def facts(self):
         """What the report says about how it was made."""
-        from btfref.representations.container import read_info
+        from btfref.representations.file.container import read_info
 
         sizes = {key: read_info(file) for key, file in self.files.items()}
         return {

@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 
 from btfref import platform, system
-from btfref.versions import versions
+from btfref.provenance import versions
 
 #: Mitsuba variants that btfref uses, and whether it can do without.
 VARIANTS = {"llvm_ad_rgb": True, "scalar_rgb": True, "cuda_ad_rgb": False}

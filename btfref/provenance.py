@@ -1,6 +1,8 @@
-"""Version of btfref and of what its results depend on."""
+"""What a result was made from: code, and versions of what runs it."""
 
 from __future__ import annotations
+
+from functools import cache
 
 __version__ = "0.1.0"
 
@@ -42,3 +44,97 @@ def versions(names=RELEVANT):
         except metadata.PackageNotFoundError:
             found[name] = None
     return found
+
+
+#: Stage → the code that its results depend on, besides that of the stages before: folders and files of the packages.
+CODE = {
+    "material": (
+        "btfref/numerics",
+        "btfref/mesostructure",
+        "btfref/sampling",
+        "btfref/conventions.py",
+        "btfref/validate/material.py",
+    ),
+    "fit": ("btfref/representations",),
+    "picture": (
+        "btfref/rendering",
+        "btfref/scene",
+        "btfref/images",
+        "btfref/gates",
+        "btfref/comparison",
+        "btfref/validate",
+        "mitsuba_plugins",
+        "shaders",
+    ),
+}
+
+#: Stages that a stage builds upon.
+BEFORE = {"material": (), "fit": ("material",), "picture": ("material", "fit")}
+
+
+@cache
+def code_of(stage, method=None):
+    """Hash of the code that results of a stage depend on.
+
+    Parameters
+    ----------
+    stage : {"material", "fit", "picture"}
+    method : str, optional
+        Registry key: its three files count, those of other methods never do.
+
+    Returns
+    -------
+    str
+    """
+    import hashlib
+    import json
+
+    from btfref.registry import methods
+
+    owned = {path for row in methods().values() for path in method_files(row)}
+    stages = (*BEFORE[stage], stage)
+    files = [path for name in stages for place in CODE[name] for path in _files(place) if path not in owned]
+    if method is not None:
+        files += method_files(methods()[method])
+    digest = hashlib.sha256()
+    for path in sorted(set(files)):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    digest.update(json.dumps(versions(), sort_keys=True).encode())
+    return digest.hexdigest()
+
+
+def method_files(row):
+    """Files of a method: fit module, Dr.Jit port, GLSL port; all of its package where that is a third party's."""
+    import importlib.util
+    from pathlib import Path
+
+    from btfref.platform import shader_directory
+
+    found = []
+    for module in (row.module, row.plugin):
+        place = Path(importlib.util.find_spec(module).origin)
+        if module.split(".")[0] in ("btfref", "mitsuba_plugins"):
+            found.append(place)
+        else:
+            top = importlib.util.find_spec(module.split(".")[0])
+            roots = list(top.submodule_search_locations or [])
+            found += [p for root in roots for p in Path(root).rglob("*") if _is_code(p)] or [place]
+    if not row.shader_package:
+        found.append(shader_directory() / row.shader)
+    return [path.resolve() for path in found]
+
+
+def _files(place):
+    from pathlib import Path
+
+    from btfref.platform import shader_directory
+
+    packages = Path(__file__).resolve().parents[1]
+    root = shader_directory() if place == "shaders" else packages / place
+    return (
+        [root.resolve()] if root.is_file() else [p.resolve() for p in sorted(root.rglob("*")) if _is_code(p)]
+    )
+
+
+def _is_code(path):
+    return path.suffix in (".py", ".glsl", ".vert", ".frag", ".toml", ".xml", ".ply", ".csv")

@@ -32,8 +32,8 @@ class Method:
     shader_package : str
         Package that holds the shader directory ("" for btfref's own).
     image_light : str
-        ``module:class`` of the prefiltered path for environments, as in :mod:`btfref.render.image_light`; "" if the
-        method has none.
+        ``module:class`` of the prefiltered path for environments, as in
+        :mod:`btfref.rendering.environment_light.image_light`; "" if the method has none.
     fit_module : str
         Module with ``fit`` and ``PRESETS``; "" if that is ``module``.
     editing : str
@@ -87,58 +87,70 @@ class Method:
         return import_module(self.editing)
 
 
-def _row(key, title, paper, *, ports=None, image_light=None, fit=None, editing=None):
+def _row(key, title, paper, module, *, ports=None, image_light=None, fit=None, editing=None):
     """A row of btfref's own; ``ports`` names the method whose ports evaluate the same maps."""
     return Method(
         key,
         title,
         paper,
-        module=f"btfref.representations.{key}",
+        module=f"btfref.representations.{module}",
         plugin=f"mitsuba_plugins.{ports or key}",
         shader=f"representations/{ports or key}.glsl",
-        image_light=f"btfref.render.image_light:{image_light}" if image_light else "",
-        fit_module=f"btfref.{fit}" if fit else "",
-        editing=f"btfref.{editing}" if editing else "",
+        image_light=f"btfref.rendering.environment_light.image_light:{image_light}" if image_light else "",
+        fit_module=f"btfref.representations.{fit}" if fit else "",
+        editing=f"btfref.representations.{editing}" if editing else "",
     )
 
 
 _ROWS = (
-    _row("raw", "Tabulated BTF, interpolated", "Dana et al. 1999"),
-    _row("svd", "Global truncated singular value decomposition", "Koudelka et al. 2003"),
-    _row("lpca", "Local PCA (eigen-BRDFs per cluster)", "Müller, Meseth, Klein 2003 and 2004"),
-    _row("laplacian", "Laplacian pyramid, components per level", "Ma et al. 2005"),
+    _row("raw", "Tabulated BTF, interpolated", "Dana et al. 1999", "tabulated.raw"),
+    _row("svd", "Global truncated singular value decomposition", "Koudelka et al. 2003", "tabulated.svd"),
+    _row(
+        "lpca", "Local PCA (eigen-BRDFs per cluster)", "Müller, Meseth, Klein 2003 and 2004", "tabulated.lpca"
+    ),
+    _row("laplacian", "Laplacian pyramid, components per level", "Ma et al. 2005", "laplacian.definition"),
     _row(
         "rf_poly",
         "Reflectance fields: biquadratic polynomials per view",
         "Meseth, Müller, Klein 2004",
+        "analytic.rf_poly",
         image_light="Polynomials",
     ),
     _row(
         "rf_lobes",
         "Reflectance fields: cosine lobes per view",
         "Meseth, Müller, Klein 2004",
+        "analytic.rf_lobes",
         image_light="Lobes",
     ),
     _row(
         "lafortune",
         "Generalized cosine lobes per texel",
         "Lafortune et al. 1997, McAllister et al. 2002",
+        "analytic.lafortune",
         image_light="Lafortune",
     ),
     _row(
         "lafortune_lut",
         "Lafortune lobes times a table over views",
         "Daubert et al. 2001",
+        "analytic.lafortune_lut",
         image_light="LafortuneTable",
     ),
-    _row("cmf", "Chained matrix factorization, clustered", "Suykens, vom Berge, Lagae, Dutré 2003"),
-    _row("hf", "Homomorphic factorization, clustered", "McCool, Ang, Ahmad 2001", ports="cmf"),
+    _row(
+        "cmf",
+        "Chained matrix factorization, clustered",
+        "Suykens, vom Berge, Lagae, Dutré 2003",
+        "factored.cmf",
+    ),
+    _row("hf", "Homomorphic factorization, clustered", "McCool, Ang, Ahmad 2001", "factored.hf", ports="cmf"),
     _row(
         "gbrdf",
         "g-BRDF: height field with editable microfacet materials",
         "Menzel, Guthe 2009",
-        fit="decomposition.pipeline",
-        editing="representations.gbrdf_maps",
+        "gbrdf.definition",
+        fit="gbrdf.decomposition.pipeline",
+        editing="gbrdf.maps",
     ),
 )
 

@@ -59,7 +59,7 @@ def assert_matches_reference(
 
     Returns
     -------
-    btfref.compare.Comparison
+    btfref.comparison.Comparison
 
     Raises
     ------
@@ -70,7 +70,7 @@ def assert_matches_reference(
     """
     import numpy as np
 
-    from btfref.compare import load_image
+    from btfref.images import load_image
     from btfref.validate.own_renderer import judge_image, reference_of
 
     __tracebackhide__ = True

@@ -14,13 +14,13 @@ import numpy as np
 from btfref.conventions import FILTER_TYPES
 from btfref.errors import InputError
 from btfref.numerics.footprint import MODES
-from btfref.numerics.frames import nearest_rotation
+from btfref.numerics.sphere.frames import nearest_rotation
 from btfref.registry import method
-from mitsuba_plugins.footprint import LevelOfDetail
-from mitsuba_plugins.guide import LightGuide
-from mitsuba_plugins.lookup import direction_table, valid_directions
-from mitsuba_plugins.proposals import Guided, Mixture
-from mitsuba_plugins.tables import tensor
+from mitsuba_plugins.lib.footprint import LevelOfDetail
+from mitsuba_plugins.lib.guide import LightGuide
+from mitsuba_plugins.lib.lookup import direction_table, valid_directions
+from mitsuba_plugins.lib.proposals import Guided, Mixture
+from mitsuba_plugins.lib.tables import tensor
 
 
 class Maps:

@@ -1,14 +1,14 @@
-"""Dr.Jit port of :mod:`btfref.representations.factored`: products of parabolic maps, for ``cmf`` and ``hf``."""
+"""Dr.Jit port of `btfref.representations.factored`: products of parabolic maps, for ``cmf`` and ``hf``."""
 
 from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
 
-from btfref.representations.factored import FACTORS, index_slots, raised
-from mitsuba_plugins.lookup import texel_stencil
-from mitsuba_plugins.parabolic import ParabolicMaps, bilinear_stencil, half_difference, unpacked
-from mitsuba_plugins.tables import read_packets, wide
+from btfref.representations.factored.definition import FACTORS, index_slots, raised
+from mitsuba_plugins.lib.lookup import texel_stencil
+from mitsuba_plugins.lib.parabolic import ParabolicMaps, bilinear_stencil, half_difference, unpacked
+from mitsuba_plugins.lib.tables import read_packets, wide
 
 
 class Evaluator:

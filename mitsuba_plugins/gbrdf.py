@@ -1,4 +1,4 @@
-"""Dr.Jit port of :mod:`btfref.representations.gbrdf`."""
+"""Dr.Jit port of :mod:`btfref.representations.gbrdf.definition`."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import drjit as dr
 import mitsuba as mi
 
 from btfref.conventions import LUMINANCE
-from btfref.numerics.frames import ROTATION_FLOOR
-from mitsuba_plugins.heightfield import HeightField
-from mitsuba_plugins.microfacets import HalfVectors, Microfacets
-from mitsuba_plugins.parabolic import ParabolicMaps, bilinear_stencil, half_sum
-from mitsuba_plugins.tables import wide
+from btfref.numerics.sphere.frames import ROTATION_FLOOR
+from mitsuba_plugins.lib.heightfield import HeightField
+from mitsuba_plugins.lib.microfacets import HalfVectors, Microfacets
+from mitsuba_plugins.lib.parabolic import ParabolicMaps, bilinear_stencil, half_sum
+from mitsuba_plugins.lib.tables import wide
 
 
 class Evaluator:
@@ -89,7 +89,7 @@ class Evaluator:
         return Microfacets(self.half_vectors, material, dr.detach(frame), w_view, share)
 
     def _texels(self, cell, local):
-        """Texels that a point blends and their weights, as `btfref.representations.gbrdf.texel_weights`."""
+        """Texels that a point blends and their weights, as `btfref.representations.gbrdf.definition.texel_weights`."""
         rows, columns = self.shape
         c0, r0 = mi.UInt32(cell.x), mi.UInt32(cell.y)
         c1, r1 = c0 + 1, r0 + 1
@@ -105,7 +105,7 @@ class Evaluator:
         ]
 
     def _frame(self, texels, active):
-        """Tangent, bitangent and normal, as `btfref.numerics.frames.surface_frame`."""
+        """Tangent, bitangent and normal, as `btfref.numerics.sphere.frames.surface_frame`."""
         total = mi.Vector4f(0)
         for texel, weight in texels:
             total = dr.fma(dr.gather(mi.Vector4f, self.surface, texel, active), weight, total)

@@ -1,4 +1,4 @@
-"""Dr.Jit port of :mod:`btfref.representations.lafortune`."""
+"""Dr.Jit port of :mod:`btfref.representations.analytic.lafortune`."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import drjit as dr
 import mitsuba as mi
 
 from btfref.numerics.powers import FLOOR
-from mitsuba_plugins.analytic import held, packet, safe_power
-from mitsuba_plugins.lookup import texel_stencil
-from mitsuba_plugins.proposals import CosineLobes
+from mitsuba_plugins.lib.analytic import held, packet, safe_power
+from mitsuba_plugins.lib.lookup import texel_stencil
+from mitsuba_plugins.lib.proposals import CosineLobes
 
 
 class Evaluator:

@@ -1,4 +1,4 @@
-"""Dr.Jit port of :mod:`btfref.representations.lafortune_lut`."""
+"""Dr.Jit port of :mod:`btfref.representations.analytic.lafortune_lut`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_plugins import lafortune
-from mitsuba_plugins.analytic import single
+from mitsuba_plugins.lib.analytic import single
 
 
 class Evaluator(lafortune.Evaluator):

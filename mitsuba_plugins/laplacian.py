@@ -1,4 +1,4 @@
-"""Dr.Jit port of :mod:`btfref.representations.laplacian`."""
+"""Dr.Jit port of :mod:`btfref.representations.laplacian.definition`."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 
 from btfref.numerics.footprint import ANISOTROPY
 from btfref.numerics.ycbcr import TO_RGB
-from mitsuba_plugins.analytic import held, safe_power
-from mitsuba_plugins.footprint import probes
-from mitsuba_plugins.lookup import Neighbour, texel_stencil
-from mitsuba_plugins.tables import PairTable, read_packets, wide
+from mitsuba_plugins.lib.analytic import held, safe_power
+from mitsuba_plugins.lib.footprint import probes
+from mitsuba_plugins.lib.lookup import Neighbour, texel_stencil
+from mitsuba_plugins.lib.tables import PairTable, read_packets, wide
 
 #: Sums are split at multiples of this: their upper parts add up without rounding. The channels and levels of a dark
-#: value cancel, and the rounding of a plain sum would then show; see shaders/lib/careful_sum.glsl.
+#: value cancel, and the rounding of a plain sum would then show; see shaders/lib/numbers/careful_sum.glsl.
 QUANTUM = 2.0**-14
 
 
@@ -96,7 +96,7 @@ class Evaluator:
     def evaluate(self, uv, w_light, w_view, active, lod=0.0, step=None, ratio=None):
         """B in 1/sr for valid directions, or its mean along a footprint; may be slightly negative.
 
-        See :class:`mitsuba_plugins.footprint.LevelOfDetail` for ``lod``, ``step`` and ``ratio``.
+        See :class:`mitsuba_plugins.lib.footprint.LevelOfDetail` for ``lod``, ``step`` and ``ratio``.
         """
         views, lights = self.views.stencil(w_view), self.lights.stencil(w_light, hold=False)
         if self.nearest:

@@ -1,12 +1,12 @@
-"""Dr.Jit port of :mod:`btfref.representations.lpca`."""
+"""Dr.Jit port of :mod:`btfref.representations.tabulated.lpca`."""
 
 from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_plugins.lookup import texel_stencil
-from mitsuba_plugins.tables import PairTable, read_packets, wide
+from mitsuba_plugins.lib.lookup import texel_stencil
+from mitsuba_plugins.lib.tables import PairTable, read_packets, wide
 
 
 class Evaluator:

@@ -1,11 +1,11 @@
-"""Dr.Jit port of :mod:`btfref.representations.raw`."""
+"""Dr.Jit port of :mod:`btfref.representations.tabulated.raw`."""
 
 from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_plugins.lookup import texel_stencil
-from mitsuba_plugins.tables import PairTable
+from mitsuba_plugins.lib.lookup import texel_stencil
+from mitsuba_plugins.lib.tables import PairTable
 
 
 class Evaluator:

@@ -1,13 +1,13 @@
-"""Dr.Jit port of :mod:`btfref.representations.rf_lobes`."""
+"""Dr.Jit port of :mod:`btfref.representations.analytic.rf_lobes`."""
 
 from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_plugins.analytic import held, packet, parabolic_axis, single, unit_lobe
-from mitsuba_plugins.lookup import texel_stencil
-from mitsuba_plugins.proposals import CosineLobes
+from mitsuba_plugins.lib.analytic import held, packet, parabolic_axis, single, unit_lobe
+from mitsuba_plugins.lib.lookup import texel_stencil
+from mitsuba_plugins.lib.proposals import CosineLobes
 
 
 class Evaluator:

@@ -1,12 +1,12 @@
-"""Dr.Jit port of :mod:`btfref.representations.rf_poly`."""
+"""Dr.Jit port of :mod:`btfref.representations.analytic.rf_poly`."""
 
 from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_plugins.analytic import held, packet, single
-from mitsuba_plugins.lookup import texel_stencil
+from mitsuba_plugins.lib.analytic import held, packet, single
+from mitsuba_plugins.lib.lookup import texel_stencil
 
 
 class Evaluator:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.numerics.directions import directions
+from btfref.numerics.sphere.directions import directions
 from btfref.registry import method
 from btfref.representations import save
 from btfref.sampling import SampledBTF

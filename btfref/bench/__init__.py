@@ -9,13 +9,13 @@ from __future__ import annotations
 #: Suites by name.
 SUITES = {
     "demand": "btfref.bench.demand",
-    "env": "btfref.bench.env",
-    "factors": "btfref.bench.factors",
-    "gbrdf": "btfref.bench.gbrdf",
-    "lobes": "btfref.bench.lobes",
-    "lod": "btfref.bench.lod",
-    "proposals": "btfref.bench.proposals",
-    "pyramid": "btfref.bench.pyramid",
-    "reflectance": "btfref.bench.reflectance",
+    "env": "btfref.bench.experiments.env",
+    "factors": "btfref.bench.experiments.factors",
+    "gbrdf": "btfref.bench.experiments.gbrdf",
+    "lobes": "btfref.bench.experiments.lobes",
+    "lod": "btfref.bench.experiments.lod",
+    "proposals": "btfref.bench.experiments.proposals",
+    "pyramid": "btfref.bench.experiments.pyramid",
+    "reflectance": "btfref.bench.experiments.reflectance",
     "synth": "btfref.bench.synth",
 }

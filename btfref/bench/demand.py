@@ -77,11 +77,11 @@ def run(*, quick=False, progress=None, btf=None, only=None):
 
 def synthesis(folder, quick, progress):
     """Parts that scenes need against the whole: times, their law, bytes, pictures."""
-    from btfref.demand import demand
-    from btfref.numerics.directions import directions
-    from btfref.sampling.part import Part
+    from btfref.numerics.sphere.directions import directions
+    from btfref.sampling.store.part import Part
     from btfref.sampling.synthesis import synthesize_store
-    from btfref.scenes import scene_file
+    from btfref.scene.demand import demand
+    from btfref.scene.shipped import scene_file
 
     texels, spp, rounds = (8, 2, 1) if quick else (64, 8, 3)
     size = (32, 32) if quick else (256, 256)
@@ -185,10 +185,11 @@ def cost_law(parts):
 
 def _pictures(folder, name, size):
     """The scene's picture from what was traced for it and from the whole: whether equal, and shares of the table."""
-    from btfref.render.reference import render
-    from btfref.representations import raw, save
+    from btfref.rendering.offline.reference import render
+    from btfref.representations import save
+    from btfref.representations.tabulated import raw
     from btfref.sampling import SampledBTF, open_store
-    from btfref.scenes import scene_file
+    from btfref.scene.shipped import scene_file
 
     scene, parameters = TRACED[name]
     images, maps, files = [], [], []
@@ -212,10 +213,10 @@ def _pictures(folder, name, size):
 def scenes(folder, btf, quick, progress):
     """What each shipped scene needs, and what its maps then cost to keep, to load and to look up."""
     from btfref.bench.data import checker
-    from btfref.demand import choice, demand, maps_needed
     from btfref.registry import method
     from btfref.representations import load, save
-    from btfref.scenes import scene_file
+    from btfref.scene.demand import choice, demand, maps_needed
+    from btfref.scene.shipped import scene_file
 
     btf = btf or checker(texels=16 if quick else 64, spp=2, progress=progress)
     methods = METHODS[1:2] if quick else METHODS
@@ -273,8 +274,8 @@ def _frames(file, parameters, whole, some, size, rounds):
 
     None with an environment, whose light comes from tables that are made of all maps.
     """
-    from btfref.render.realtime import Renderer
-    from btfref.render.scene import read_scene
+    from btfref.rendering.gl.renderer import Renderer
+    from btfref.scene.description import read_scene
 
     scene = read_scene(file, parameters, size=size)
     if scene.environment is not None:
@@ -303,7 +304,7 @@ def _memory(needed, whole):
 
 def _bytes_read(path, kept):
     """Bytes of a file that loading a choice reads: all where rows and parts of their own are not worth it."""
-    from btfref.representations.container import bytes_of_choice
+    from btfref.representations.file.container import bytes_of_choice
 
     return bytes_of_choice(path, kept)
 

@@ -63,7 +63,7 @@ def evaluation(kind, built, path, points, query):
     elif kind == "drjit":
         yield _drjit(path, points, query)
     else:
-        from btfref.render.probe import broadcast_points, probe_points
+        from btfref.rendering.gl.probe import broadcast_points, probe_points
 
         rows, _ = broadcast_points(*points)
         with probe_points(built.representation, rows, filter_type=query.get("filter_type")) as made:

@@ -235,9 +235,9 @@ def measure_realtime(entry, path, plan):
     ------
     dict
     """
-    from btfref.render.realtime import Renderer
-    from btfref.render.scene import read_scene
-    from btfref.scenes import scene_file
+    from btfref.rendering.gl.renderer import Renderer
+    from btfref.scene.description import read_scene
+    from btfref.scene.shipped import scene_file
 
     for query in entry.query:
         for size in plan.settings["frames"]:

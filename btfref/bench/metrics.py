@@ -102,8 +102,8 @@ def errors(folder, record):
         as colours), ``bias`` over the mean; ``rmse`` and ``delta_e00`` with the ends of their 99 % intervals
         (normal, over the random choice of entries, by the delta method).
     """
-    from btfref.compare import metrics
-    from btfref.compare.colour import ciede2000, lab
+    from btfref.comparison import metrics
+    from btfref.comparison.colour import ciede2000, lab
 
     expected = np.load(Path(folder) / record["queries"])["expected"].astype(float)
     found = np.load(Path(folder) / record["values"]).astype(float)

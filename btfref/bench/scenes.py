@@ -35,7 +35,7 @@ def scene(name, bsdf, *, size, integrator=None):
     """
     import mitsuba as mi
 
-    from btfref.scenes import scene_file
+    from btfref.scene.shipped import scene_file
 
     t = mi.ScalarTransform4f
     kind, light = name.split(", ")

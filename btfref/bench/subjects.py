@@ -59,7 +59,7 @@ def build(entry, btf, *, seed=0, payload=None, progress=None):
 
 def payload_of(rep):
     """Bytes of a representation's maps."""
-    from btfref.representations.container import payload_bytes
+    from btfref.representations.file.container import payload_bytes
 
     return payload_bytes({name: (a.shape, a.dtype.name) for name, a in rep.maps.items()}, rep.meta)
 
@@ -75,7 +75,7 @@ def local_pca(btf, *, seed=0, clusters=16, components=4):
     from sklearn.cluster import KMeans
     from sklearn.decomposition import PCA
 
-    from btfref.numerics.lowrank import texel_matrix
+    from btfref.numerics.solvers.lowrank import texel_matrix
 
     matrix = texel_matrix(btf.values)
     labels = KMeans(clusters, random_state=seed).fit_predict(matrix)

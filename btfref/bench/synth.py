@@ -189,7 +189,7 @@ def z_limit(significance=SIGNIFICANCE, n_tests=PAIRS):
     """|z| that the largest of some standard normals exceeds with a probability (Šidák 1967)."""
     from scipy import special
 
-    from btfref.compare.significance import sidak
+    from btfref.comparison.significance import sidak
 
     return float(-special.ndtri(sidak(significance, n_tests) / 2))
 
@@ -211,7 +211,7 @@ def bias(runs, reference):
     """
     from scipy import special
 
-    from btfref.compare.significance import interval, welch_test
+    from btfref.comparison.significance import interval, welch_test
 
     runs, reference = np.asarray(runs, np.float64), np.asarray(reference, np.float64)
     n, m = len(runs), len(reference)

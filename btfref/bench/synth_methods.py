@@ -15,7 +15,7 @@ import time
 
 import numpy as np
 
-from btfref.numerics.directions import directions
+from btfref.numerics.sphere.directions import directions
 
 #: Pairs at which errors are measured.
 PAIRS = 12
@@ -213,7 +213,7 @@ class SharedPaths(_Subject):
         self.time(0, 2)
 
     def _made(self, lights, seed):
-        from btfref.sampling.texel_paths import TexelPaths
+        from btfref.sampling.paths.texels import TexelPaths
 
         class Images(TexelPaths):
             def _statistics(self, pieces):
@@ -269,7 +269,7 @@ class SharedPoints(_Subject):
         """Images of the pairs, of the whole BTF where it was made; else points and walks of their directions alone."""
         import drjit as dr
 
-        from btfref.sampling.surface_estimator import SurfaceEstimator
+        from btfref.sampling.surface.estimator import SurfaceEstimator
 
         if seed in self.full:
             return self.full[seed]
@@ -311,7 +311,7 @@ def _peak():
 def _growth(job):
     """Time and memory of one setting, results not kept: what a store would be given view by view."""
     from btfref.mesostructure import build
-    from btfref.sampling.surface_estimator import SurfaceEstimator
+    from btfref.sampling.surface.estimator import SurfaceEstimator
 
     vectors = directions(job["directions"]).vectors
     tile = build(job["mesostructure"])

@@ -8,7 +8,7 @@ import statistics
 import time
 from pathlib import Path
 
-from btfref.versions import versions
+from btfref.provenance import versions
 
 
 def machine():

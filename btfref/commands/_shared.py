@@ -142,7 +142,7 @@ def direction_set(text):
     Returns
     -------
     str or ndarray, shape (n, 3)
-        What `btfref.numerics.directions.directions` takes.
+        What `btfref.numerics.sphere.directions.directions` takes.
     """
     if not text.endswith((".txt", ".csv")):
         return text
@@ -269,7 +269,7 @@ def write_images(image, out, *, png=False, classes=None, classes_out=None):
     classes : ndarray of uint8, shape (H, W), optional
         Pixel classes, written to `classes_out`.
     """
-    from btfref.compare import save_image
+    from btfref.images import save_image
 
     save_image(out, image)
     if png:
@@ -283,10 +283,10 @@ _CLASS_GREYS = (0, 100, 200, 250)
 
 
 def save_classes(path, classes):
-    """Write pixel classes (see `btfref.render.classes`) as a grey PNG: black, dark, light, nearly white."""
+    """Write pixel classes (see `btfref.scene.pixel_classes`) as a grey PNG: black, dark, light, nearly white."""
     import numpy as np
 
-    from btfref.compare.png import encode_png
+    from btfref.images.png import encode_png
 
     temporary = path.with_name(f".{path.name}.partial")
     try:

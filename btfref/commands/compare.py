@@ -1,6 +1,6 @@
 """Compare an image with its reference: errors by pixel class, and gates; exit status 1 when a gate fails.
 
-Errors are taken on linear radiance. --gate names an entry of btfref/compare/tolerances.toml, e.g.
+Errors are taken on linear radiance. --gate names an entry of btfref/gates/tolerances.toml, e.g.
 image.noise_free; without it the errors are reported only. --classes is a file that `btfref render --classes`
 wrote.
 
@@ -53,7 +53,8 @@ def run(args):
     """Carry the command out."""
     report = output_file(args.report, ".html") if args.report else None
 
-    from btfref.compare import compare, load_image
+    from btfref.comparison import compare
+    from btfref.images import load_image
 
     test = load_image(args.test)
     if Path(args.reference).suffix.lower() in (".exr", ".png"):
@@ -69,8 +70,8 @@ def run(args):
         comparison = _against_scene(args, test)
         reference = comparison.reference.astype("float32")
     if report:
+        from btfref.provenance import versions
         from btfref.report import Cell, write_report
-        from btfref.versions import versions
 
         images = {"reference": reference, "test": test}
         cell = Cell(f"{Path(args.test).stem} against {Path(args.reference).stem}", images, comparison, "")

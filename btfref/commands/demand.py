@@ -64,7 +64,7 @@ def add_scene_arguments(parser):
 
 def run(args):
     """Carry the command out."""
-    from btfref.demand import maps_needed
+    from btfref.scene.demand import maps_needed
 
     shape = None
     if args.views or args.lights or args.texels:
@@ -97,8 +97,8 @@ def run(args):
 
 
 def whole_shape(views, lights, texels):
-    """Shape of a BTF that is not there yet, for :func:`btfref.demand.demand`."""
-    from btfref.numerics.directions import directions
+    """Shape of a BTF that is not there yet, for :func:`btfref.scene.demand.demand`."""
+    from btfref.numerics.sphere.directions import directions
 
     return directions(direction_set(views)), directions(direction_set(lights)), (texels, texels)
 
@@ -113,8 +113,8 @@ def union(args, scenes, shape):
     """
     import itertools
 
-    from btfref.demand import demand
-    from btfref.scenes import scene_file
+    from btfref.scene.demand import demand
+    from btfref.scene.shipped import scene_file
 
     fixed = assignments(args.define, convert=str, option="-D")
     swept = assignments(args.sweep, convert=lambda text: text.split(","), option="--sweep")

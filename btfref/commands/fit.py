@@ -46,7 +46,7 @@ def run(args):
         given["target_error"] = args.target_error
     parameters = fit_parameters(row, args.preset, given)
 
-    from btfref.representations.container import read_info, save
+    from btfref.representations.file.container import read_info, save
     from btfref.sampling import SampledBTF, open_store
 
     if args.partial:

@@ -97,14 +97,14 @@ def run(args):
 
 def _representation(args, out):
     """A representation from pictures."""
-    from btfref.representations.container import read_info, save
+    from btfref.representations.file.container import read_info, save
 
     if args.format == "maps":
         from btfref.formats.maps import import_maps
 
         representation = import_maps(args.path)
     else:
-        from btfref.representations.gbrdf_build import from_photograph
+        from btfref.representations.gbrdf.build import from_photograph
 
         representation = from_photograph(args.path)
     save(representation, out)

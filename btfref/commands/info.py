@@ -82,7 +82,7 @@ def read(path):
         return _exr(path)
     if path.is_file() and path.suffix.lower() != ".exr" and (measured := _measured(path)):
         return measured
-    from btfref.representations.container import read_info
+    from btfref.representations.file.container import read_info
 
     return read_info(path)
 
@@ -115,7 +115,7 @@ def _headers(path):
 
 def _plain_exr(path):
     """Whether this is an OpenEXR image rather than a representation; broken files count as the latter."""
-    from btfref.representations.container import ATTRIBUTE
+    from btfref.representations.file.container import ATTRIBUTE
 
     headers = _headers(path)
     return headers is not None and ATTRIBUTE not in headers[0]

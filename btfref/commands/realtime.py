@@ -20,8 +20,8 @@ from btfref.commands._shared import (
     write_images,
 )
 from btfref.errors import InputError
-from btfref.render.paths import PATHS
-from btfref.scenes import scene_file
+from btfref.rendering.environment_light.ways import PATHS
+from btfref.scene.shipped import scene_file
 
 
 def add_arguments(parser):
@@ -66,10 +66,10 @@ def add_arguments(parser):
 
 
 def transfer_settings(items):
-    """``KEY=VALUE`` as :class:`btfref.render.transfer.TransferSettings`."""
+    """``KEY=VALUE`` as :class:`btfref.rendering.environment_light.transfer.TransferSettings`."""
     from dataclasses import fields
 
-    from btfref.render.transfer import TransferSettings
+    from btfref.rendering.environment_light.transfer import TransferSettings
 
     given = assignments(items, option="--transfer")
     known = [field.name for field in fields(TransferSettings)]
@@ -88,7 +88,7 @@ def run(args):
     scene, out = scene_file(args.scene), output_file(args.output, ".exr")
     parameters = assignments(args.define, convert=str, option="-D")
 
-    from btfref.render.realtime import realtime
+    from btfref.rendering.gl.renderer import realtime
 
     result = realtime(
         scene,

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from btfref.commands._shared import assignments, count, emit, output_file, size, write_images
 from btfref.errors import InputError
-from btfref.scenes import scene_file
+from btfref.scene.shipped import scene_file
 
 
 def add_arguments(parser):
@@ -52,12 +52,12 @@ def run(args):
     classes_out = output_file(args.classes, ".png") if args.classes else None
 
     if args.geometry:
-        from btfref.render.geometry import render_geometry
+        from btfref.rendering.offline.geometry import render_geometry
 
         options = {"spp": args.spp} if args.spp else {}
         result = render_geometry(scene, parameters=parameters, seed=args.seed, size=args.size, **options)
     else:
-        from btfref.render.reference import render
+        from btfref.rendering.offline.reference import render
 
         result = render(
             scene,
@@ -75,7 +75,7 @@ def run(args):
         emit(f"{lost} channels are no numbers: lookups outside of what the file holds, or broken materials")
     classes = None
     if classes_out:
-        from btfref.render.classes import pixel_classes
+        from btfref.scene.pixel_classes import pixel_classes
 
         classes = pixel_classes(scene, parameters=parameters, size=args.size, grid=args.noise_free or 4)
     write_images(result.image, out, png=args.png, classes=classes, classes_out=classes_out)

@@ -174,7 +174,7 @@ def run(args):
             option = f"--{key.replace('_', '-')}"
             raise InputError("not a parameter of the mesostructure", field="--set", got=key, expected=option)
 
-    from btfref.sampling.part import Part
+    from btfref.sampling.store.part import Part
     from btfref.sampling.synthesis import synthesize_store
 
     only = Part(args.only_views, args.only_lights, args.only_tiles)

@@ -6,12 +6,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from btfref.compare import metrics, significance
-from btfref.compare.colour import delta_e00, fit_display
-from btfref.compare.flip import exposure_range, flip_map
-from btfref.compare.gates import GateResult, Measured, judge
-from btfref.compare.tolerances import gate_table, limits, tolerance
+from btfref.comparison import metrics, significance
+from btfref.comparison.colour import delta_e00
+from btfref.comparison.flip import exposure_range, flip_map
 from btfref.errors import InputError
+from btfref.gates.tolerances import gate_table, limits, tolerance
+from btfref.gates.verdicts import GateResult, Measured, judge
+from btfref.images.display import fit_display
 
 #: Pixel class → its number in a class map.
 CLASSES = {"background": 0, "interior": 1, "silhouette": 2, "mesostructure": 3}
@@ -247,7 +248,7 @@ def _image(side, name):
     if hasattr(side, "image"):
         side = side.image
     elif isinstance(side, str) or hasattr(side, "__fspath__"):
-        from btfref.compare.images import load_image
+        from btfref.images.files import load_image
 
         side = load_image(side)
     image = np.asarray(side, np.float64)

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from btfref.compare.colour import LUMINANCE
-from btfref.compare.metrics import paired
+from btfref.comparison.metrics import paired
+from btfref.conventions import LUMINANCE
 from btfref.errors import InputError
 
 #: Pixels per degree of visual angle: 0.7 m from a 0.7 m wide display of 3840 pixels, the authors' default.

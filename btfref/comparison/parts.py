@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from btfref.compare.colour import delta_e00
-from btfref.compare.significance import Interval, interval, rmse_interval
-from btfref.compare.waterfall import CONFIDENCE
+from btfref.comparison.colour import delta_e00
+from btfref.comparison.significance import Interval, interval, rmse_interval
+from btfref.comparison.waterfall import CONFIDENCE
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def part(name, of, test, reference, display):
     ----------
     name, of : str
     test, reference : array, shape (pixels, 3)
-    display : btfref.compare.Display
+    display : btfref.comparison.Display
 
     Returns
     -------

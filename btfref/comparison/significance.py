@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from btfref.compare.metrics import paired
+from btfref.comparison.metrics import paired
 from btfref.errors import InputError
 
 

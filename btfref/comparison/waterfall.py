@@ -18,10 +18,10 @@ from itertools import combinations
 
 import numpy as np
 
-from btfref.compare.colour import delta_e00
-from btfref.compare.gates import Measured, judge
-from btfref.compare.significance import Interval, interval, rmse_interval
+from btfref.comparison.colour import delta_e00
+from btfref.comparison.significance import Interval, interval, rmse_interval
 from btfref.errors import InputError
+from btfref.gates.verdicts import Measured, judge
 
 #: Of every interval.
 CONFIDENCE = 0.99
@@ -120,7 +120,7 @@ class Waterfall:
         Total − stages − covariances: 0 up to noise.
     products : tuple of Product
         The largest first.
-    parts : tuple of btfref.compare.parts.Part
+    parts : tuple of btfref.comparison.parts.Part
         Shares of stages that are known by themselves.
     mean : float
         Mean of the first picture where it counts.
@@ -217,9 +217,9 @@ def waterfall(pictures, mask, display, *, parts=()):
         The truth first; at least two.
     mask : (H, W) bool array
         Pixels that count; at least one.
-    display : btfref.compare.Display
+    display : btfref.comparison.Display
         For ΔE00.
-    parts : sequence of btfref.compare.parts.Part
+    parts : sequence of btfref.comparison.parts.Part
         Shares of stages, to be told beside them.
 
     Returns

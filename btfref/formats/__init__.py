@@ -25,12 +25,12 @@ __all__ = [
 
 #: name -> "module:object", imported when asked for; the order in which files are tried.
 FORMATS = {
-    "bonn": "btfref.formats.bonn:FORMAT",
+    "bonn": "btfref.formats.bonn.reader:FORMAT",
     "mif": "btfref.formats.mif:FORMAT",
     "merl": "btfref.formats.merl:FORMAT",
-    "spectral": "btfref.formats.spectral:FORMAT",
-    "utia": "btfref.formats.utia:FORMAT",
-    "ubo": "btfref.formats.ubo:FORMAT",
+    "spectral": "btfref.formats.image_sets.spectral:FORMAT",
+    "utia": "btfref.formats.image_sets.utia:FORMAT",
+    "ubo": "btfref.formats.image_sets.ubo:FORMAT",
 }
 
 ENTRY_POINT_GROUP = "btfref.formats"
@@ -83,7 +83,7 @@ def identify(path):
     InputError
         Missing or empty file, or an archive that is damaged or dangerous.
     """
-    from btfref.formats.files import Probe
+    from btfref.formats.image_sets.files import Probe
 
     probe = Probe(path)
     return next((name for name in names() if format_named(name).recognises(probe)), None)

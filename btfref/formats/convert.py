@@ -10,10 +10,10 @@ import numpy as np
 from btfref.errors import InputError
 from btfref.formats import open_source
 from btfref.formats.source import MEMORY
-from btfref.sampling.layout import TILE, remove_leftovers, remove_store
-from btfref.sampling.resume import resumable
-from btfref.sampling.store import create_store
-from btfref.versions import versions
+from btfref.provenance import versions
+from btfref.sampling.store.layout import TILE, remove_leftovers, remove_store
+from btfref.sampling.store.resume import resumable
+from btfref.sampling.store.store import create_store
 
 
 def import_btf(

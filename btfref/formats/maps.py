@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from btfref.errors import InputError
+from btfref.outputs import new_folder
 from btfref.registry import method
-from btfref.sampling.layout import refuse_existing
 
 
 def export_maps(path, out):
@@ -42,9 +38,9 @@ def export_maps(path, out):
     Axes before the last fold into rows and columns as in the representation's file: trailing ones into columns while
     they fit. Indices are written as floats.
     """
-    from btfref.formats.pictures import write_exr
-    from btfref.representations.container import load
-    from btfref.representations.map_images import image_size
+    from btfref.images.decoding import write_exr
+    from btfref.representations.file.container import load
+    from btfref.representations.file.map_images import image_size
 
     representation = load(path)
     row = method(representation.meta["method"])
@@ -70,29 +66,6 @@ def export_maps(path, out):
                 )
                 count += 1
     return {"format": "maps", "maps": len(arrays), "images": count}
-
-
-@contextmanager
-def new_folder(out):
-    """A folder to fill, which gets its name ``out`` when all is written; nothing is left behind otherwise.
-
-    Raises
-    ------
-    InputError
-        An existing path, or no folder to make it in.
-    """
-    out = Path(out)
-    refuse_existing(out)
-    if not out.absolute().parent.is_dir():
-        raise InputError("no such folder", file=out.parent)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.absolute().parent))
-    try:
-        folder = temporary / "maps"
-        folder.mkdir()
-        yield folder
-        os.replace(folder, out)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def import_maps(folder):

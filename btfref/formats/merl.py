@@ -14,7 +14,7 @@ import numpy as np
 
 from btfref.formats.reading import Reader
 from btfref.formats.source import Format, Source
-from btfref.numerics.directions import directions
+from btfref.numerics.sphere.directions import directions
 
 SCALE = np.array([1.0, 1.15, 1.66]) / 1500
 
@@ -38,7 +38,7 @@ def open_merl(path, *, views="ubo81", lights="ubo81"):
     ----------
     path : path-like
     views, lights : str, DirectionSet or array_like (n, 3)
-        Directions of the BTF; see `btfref.numerics.directions.directions`.
+        Directions of the BTF; see `btfref.numerics.sphere.directions.directions`.
 
     Returns
     -------

@@ -1,7 +1,7 @@
 """UTIA's container MIF: chunks of images and an XML text that says which directions they belong to.
 
-Facts of the layout: MIFlib 0.4. Values are UTIA's (`btfref.formats.utia`): reflectance factors, without the light's
-cosine; XYZ under D65 unless the XML names another colour space, 8 and 16 bits sRGB.
+Facts of the layout: MIFlib 0.4. Values are UTIA's (`btfref.formats.image_sets.utia`): reflectance factors, without
+the light's cosine; XYZ under D65 unless the XML names another colour space, 8 and 16 bits sRGB.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from xml.etree import ElementTree
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.formats.angles import arrange
+from btfref.formats.image_sets.angles import arrange
+from btfref.formats.image_sets.utia import SCALE, WHITE
 from btfref.formats.reading import Reader
 from btfref.formats.source import LARGEST_COUNT, Format, Source
-from btfref.formats.utia import SCALE, WHITE
 from btfref.numerics.colour import decode_srgb, rgb_from_xyz
 
 MAGIC = b"MIF FILE"

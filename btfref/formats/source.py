@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics.directions import NAMED_RINGS, RING_TOLERANCE, checked, directions, spherical
+from btfref.numerics.sphere.directions import NAMED_RINGS, RING_TOLERANCE, checked, directions, spherical
 
 #: Bytes that a conversion may hold at a time, unless told otherwise.
 MEMORY = 2 << 30
@@ -96,7 +96,7 @@ class Format:
     ----------
     name, title : str
     recognises : callable
-        ``recognises(probe) -> bool``, from the first bytes and the names (`btfref.formats.files.Probe`).
+        ``recognises(probe) -> bool``, from the first bytes and the names (`btfref.formats.image_sets.files.Probe`).
     open : callable
         ``open(path, **options) -> Source``; raises InputError.
     options : frozenset of str
@@ -121,7 +121,7 @@ class Format:
 
     def export_checked(self, btf, path, settings):
         """`export` likewise, to a path that does not exist."""
-        from btfref.sampling.layout import refuse_existing
+        from btfref.outputs import refuse_existing
 
         if self.export is None:
             raise InputError("this format is only read", field="format", got=repr(self.name))

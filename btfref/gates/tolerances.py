@@ -71,7 +71,7 @@ def parse(text, *, file="tolerances.toml"):
 
 @functools.cache
 def _shipped():
-    return parse(resources.files("btfref.compare").joinpath("tolerances.toml").read_text("utf-8"))
+    return parse(resources.files("btfref.gates").joinpath("tolerances.toml").read_text("utf-8"))
 
 
 def gate_keys():

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from btfref.compare.tolerances import gate_table, limits
 from btfref.errors import InputError
+from btfref.gates.tolerances import gate_table, limits
 
 
 @dataclass(frozen=True)

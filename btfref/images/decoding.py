@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.formats import radiance
+from btfref.images import radiance
 
 #: Bytes of one decoded picture.
 LARGEST = 1 << 30

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from btfref.compare.colour import Display, decode_srgb
 from btfref.errors import InputError
+from btfref.images.display import Display
+from btfref.numerics.colour import decode_srgb
 
 _MAGIC = {".exr": b"\x76\x2f\x31\x01", ".png": b"\x89PNG\r\n\x1a\n"}
 
@@ -88,7 +89,7 @@ def save_image(path, image, *, display=None, attributes=None):
         with replacing(path) as temporary:
             OpenEXR.File(header, channels).write(str(temporary))
     elif kind == ".png":
-        from btfref.compare.png import encode_png
+        from btfref.images.png import encode_png
 
         encoded = (display or Display()).encoded(image)
         with replacing(path) as temporary:

@@ -131,7 +131,7 @@ def as_numbers(image):
 
 def linear_colours(image):
     """Colours of an image, linear RGB float32 (rows, columns, 3): 8- and 16-bit images hold sRGB."""
-    from btfref.compare.colour import decode_srgb
+    from btfref.numerics.colour import decode_srgb
 
     values = as_numbers(image) if image.dtype.kind == "f" else decode_srgb(as_numbers(image))
     return np.broadcast_to(values, (*values.shape[:2], 3)).astype(np.float32)

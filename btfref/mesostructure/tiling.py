@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from btfref.mesostructure.materials import load_bsdf
-from btfref.numerics.transfer import to_device
+from btfref.numerics.device_arrays import to_device
 
 
 def tile_group(mesostructure, bsdfs=None):

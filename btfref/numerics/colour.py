@@ -7,9 +7,6 @@ from importlib import resources
 
 import numpy as np
 
-#: Luminance of linear Rec. 709 (ITU-R BT.709-6, item 3.2).
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-
 
 def _rgb_to_xyz():
     """Matrix from the chromaticities of the primaries and of D65 (ITU-R BT.709-6, item 1.3 and 1.4)."""

@@ -5,7 +5,7 @@ w through (u, v) on the plane z = 0 is at ``uv + z w_xy / w_z`` at height z. It 
 its bottom, cell by cell; in a cell the height above the surface is a quadratic in the ray's parameter, whose first root
 is the hit. Source of the idea: parallax occlusion mapping (N. Tatarchuk, "Dynamic Parallax Occlusion Mapping with
 Approximate Soft Shadows", 2006), whose linear search and refinement the quadratic replaces. The ports are
-:mod:`mitsuba_plugins.heightfield` and ``shaders/lib/heightfield.glsl``.
+:mod:`mitsuba_plugins.lib.heightfield` and ``shaders/lib/surface/heightfield.glsl``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from btfref.numerics.precision import real
+from btfref.precision import real
 
 #: Tiles that a ray may travel sideways: what bounds the steps at grazing. Steeper than that it never is: its tangent is
 #: held at this limit, which is part of the definition. 4 tiles through a field 0.15 deep are 88° from the normal.

@@ -10,7 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from btfref.numerics.parabolic import (
+from btfref.numerics.sphere.parabolic import (
     bilinear_stencil,
     solid_angle_density,
     square_to_hemisphere,
@@ -120,7 +120,7 @@ def isotropic_ndf(roughness, n=32):
         GGX α in (0, 1].
     n : int
     """
-    from btfref.numerics.parabolic import texel_directions, texel_solid_angles
+    from btfref.numerics.sphere.parabolic import texel_directions, texel_solid_angles
 
     z = np.maximum(texel_directions(n)[..., 2], 0)
     a2 = roughness * roughness

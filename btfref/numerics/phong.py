@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.numerics.levenberg import backend, fit_batch
 from btfref.numerics.powers import safe_power
-from btfref.numerics.precision import real
+from btfref.numerics.solvers.levenberg import backend, fit_batch
+from btfref.precision import real
 
 #: Exponents that the fits start from: one lane each, the best wins.
 STARTS = (1.0, 4.0, 16.0, 64.0, 256.0)

@@ -3,7 +3,7 @@
 Meseth, Müller and Klein (2004), section 5.3, report white pixels from ``(t · l)^n``, whose stored ``t`` and ``n``
 overflow while rendering. Here the power is taken in the log domain and saturates at a number that every floating-point
 type of interest holds, so that no stored parameter can overflow. Ports: ``mitsuba_plugins/powers.py``,
-``shaders/lib/powers.glsl``.
+``shaders/lib/numbers/powers.glsl``.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from btfref.numerics.precision import real
+from btfref.precision import real
 
 #: Bases below the smallest positive half count as zero, in every type: flushing of subnormal numbers then does not
 #: decide the result.

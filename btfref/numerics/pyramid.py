@@ -14,7 +14,7 @@ import numpy as np
 
 from btfref.conventions import FILTER_TYPES
 from btfref.errors import InputError
-from btfref.numerics.precision import real
+from btfref.precision import real
 
 #: Kernels of the reduction. "binomial": (1 3 3 1)/8 for even sizes, centred between the two texels that become one.
 #: "box": (1 1 1)/3 about the first of the two (Ma et al. 2005), which shifts a level by half a texel of the finer one.

@@ -1,1 +1,1 @@
-"""Reading scenes and rendering them: the Mitsuba reference, the real-time renderer and the GLSL composer."""
+"""Rendering: offline by Mitsuba, in real time by OpenGL, and light from environments for both."""

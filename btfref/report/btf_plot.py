@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from btfref.compare.colour import encode_srgb
 from btfref.errors import InputError
-from btfref.sampling.store import open_store
+from btfref.numerics.colour import encode_srgb
+from btfref.sampling.store.store import open_store
 
 #: Most views and most lights of the contact sheet, lights of the apparent BRDFs, views that maps are averaged over.
 SHEET, LOBES, AVERAGED = 7, 4, 12

@@ -9,9 +9,9 @@ from importlib import resources
 
 import numpy as np
 
-from btfref.compare.colour import Display, fit_display
-from btfref.compare.comparison import CLASSES, Comparison, json_safe
+from btfref.comparison.comparison import CLASSES, Comparison, json_safe
 from btfref.errors import InputError
+from btfref.images.display import Display, fit_display
 
 #: Label of a picture → its name and what it shows.
 LABELS = {

@@ -6,9 +6,9 @@ import json
 from html import escape
 from pathlib import Path
 
-from btfref.compare.comparison import json_safe
-from btfref.compare.tolerances import gate_table
+from btfref.comparison.comparison import json_safe
 from btfref.errors import InputError
+from btfref.gates.tolerances import gate_table
 from btfref.report.cell import asset, script_json
 from btfref.report.overview import overview, verdict
 from btfref.report.stage import article
@@ -76,7 +76,7 @@ def write_report(path, *, title, cells, facts):
     InputError
         No cells, pictures of different shapes within a cell, a wrong ending or a missing folder.
     """
-    from btfref.compare.images import replacing
+    from btfref.images.files import replacing
 
     path, cells = Path(path), list(cells)
     if path.suffix.lower() not in (".html", ".htm"):

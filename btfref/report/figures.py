@@ -7,7 +7,7 @@ from html import escape
 
 import numpy as np
 
-from btfref.compare.png import encode_png
+from btfref.images.png import encode_png
 from btfref.report import svg
 
 #: Decades of relative error that the histogram shows; smaller ones, and zero, fall into its first bin.

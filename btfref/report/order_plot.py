@@ -9,7 +9,8 @@ def plot_orders(entries, path):
     Parameters
     ----------
     entries : sequence of dict
-        ``environment``, ``way`` ("order n"; others are left out), ``window``, ``rmse``; see :mod:`btfref.bench.env`.
+        ``environment``, ``way`` ("order n"; others are left out), ``window``, ``rmse``; see
+        :mod:`btfref.bench.experiments.env`.
     path : path-like
         ``.png``.
     """

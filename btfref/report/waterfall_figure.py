@@ -21,7 +21,7 @@ def waterfall_figure(fall):
     Parameters
     ----------
     fall : dict
-        `btfref.compare.waterfall.Waterfall.to_dict`.
+        `btfref.comparison.waterfall.Waterfall.to_dict`.
 
     Returns
     -------

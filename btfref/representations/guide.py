@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.numerics.clustering import lloyd
+from btfref.numerics.solvers.clustering import lloyd
 
 #: Groups of a texture. On the checker 16 leave a variance of 0.41 times that of cosine sampling in a constant
 #: environment (median over texels and views), 64 leave 0.22, 256 leave 0.15 for four times the memory.

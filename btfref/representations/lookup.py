@@ -8,8 +8,8 @@ import numpy as np
 
 from btfref import conventions
 from btfref.errors import InputError
-from btfref.numerics import interpolation
-from btfref.numerics.precision import real
+from btfref.numerics.sphere import interpolation
+from btfref.precision import real
 
 #: Points evaluated at a time: bounds the memory of the gathered neighbourhoods.
 CHUNK = 1 << 14
@@ -161,7 +161,7 @@ def base_meta(method, btf, parameters, *, filter_type="bilinear"):
 
 def meta_for(method, texels, views, lights, parameters, *, filter_type="bilinear", parent=None):
     """The same for maps that were not fitted to a sampled BTF: its directions, texels and attributes one by one."""
-    from btfref.versions import versions
+    from btfref.provenance import versions
 
     return {
         "method": method,

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.sampling import adaptive
 from btfref.sampling.memory import blocks
-from btfref.sampling.part import Part
+from btfref.sampling.paths import adaptive
+from btfref.sampling.store.part import Part
 from btfref.sampling.variant import mitsuba_variant
 
 #: Streams of random numbers of a synthesis to a target error.
@@ -114,7 +114,7 @@ def _fill_by_texels(job, store, views, only, plan, size):
 
 def _requests(store, views, pairs, wanted, plan):
     """What is missing of some views, file by file; with where it goes, and whether it is the last of its view."""
-    from btfref.sampling.texel_paths import Request
+    from btfref.sampling.paths.texels import Request
 
     regions = list(_regions(store))
     for view in views:

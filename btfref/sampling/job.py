@@ -12,24 +12,24 @@ import numpy as np
 from btfref.errors import InputError
 from btfref.mesostructure import build
 from btfref.mesostructure.materials import load_bsdf
-from btfref.numerics.directions import directions
-from btfref.sampling import adaptive
+from btfref.numerics.sphere.directions import directions
+from btfref.provenance import versions
 from btfref.sampling.fallback import reason_against_surface
-from btfref.sampling.layout import TILE, remove_leftovers
-from btfref.sampling.part import Part
-from btfref.sampling.resume import resumable
+from btfref.sampling.paths import adaptive
+from btfref.sampling.paths.texels import STREAMS
 from btfref.sampling.scheduling import run
-from btfref.sampling.store import create_store
-from btfref.sampling.texel_paths import STREAMS
+from btfref.sampling.store.layout import TILE, remove_leftovers
+from btfref.sampling.store.part import Part
+from btfref.sampling.store.resume import resumable
+from btfref.sampling.store.store import create_store
 from btfref.sampling.variant import mitsuba_variant
-from btfref.versions import versions
 
 #: name -> "module:class". An estimator is made from (mesostructure, light vectors, all view vectors, texels,
 #: spp, seed, max_depth, wanted views, mask of texels); ``all_views(views)`` yields (view, mean, variance of
 #: the mean), arrays (lights, rows, columns, 3) float32. Any order and any subset gives the same bytes.
 ESTIMATORS = {
-    "path": "btfref.sampling.texel_paths:TexelPaths",
-    "surface": "btfref.sampling.surface_estimator:SurfaceEstimator",
+    "path": "btfref.sampling.paths.texels:TexelPaths",
+    "surface": "btfref.sampling.surface.estimator:SurfaceEstimator",
 }
 
 #: What a result depends on; recorded with it.

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics.directions import DirectionSet, checked
-from btfref.sampling.layout import TILE, refuse_existing, remove_leftovers, replace_store
-from btfref.sampling.store import create_store, open_store
+from btfref.numerics.sphere.directions import DirectionSet, checked
+from btfref.outputs import refuse_existing
+from btfref.sampling.store.layout import TILE, remove_leftovers, replace_store
+from btfref.sampling.store.store import create_store, open_store
 
 
 @dataclass(frozen=True, eq=False)

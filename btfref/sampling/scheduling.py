@@ -9,9 +9,9 @@ from pathlib import Path
 
 from btfref.errors import InputError, MissingDependencyError
 from btfref.sampling.filling import fill
-from btfref.sampling.layout import DRAFT
 from btfref.sampling.memory import default_budget, peak
-from btfref.sampling.store import open_store
+from btfref.sampling.store.layout import DRAFT
+from btfref.sampling.store.store import open_store
 
 #: Tasks per worker: enough that a slow or lost worker costs little, few enough that scenes are not built for nothing.
 TASKS_PER_WORKER = 6

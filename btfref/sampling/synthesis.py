@@ -10,8 +10,8 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.sampling.job import ESTIMATORS, Job
-from btfref.sampling.layout import CONVENTIONS, check_finite
 from btfref.sampling.sampled_btf import SampledBTF
+from btfref.sampling.store.layout import CONVENTIONS, check_finite
 from btfref.sampling.variant import mitsuba_variant
 
 __all__ = ["ESTIMATORS", "Job", "synthesize", "synthesize_store"]
@@ -49,7 +49,7 @@ def synthesize(
     texels : int or (int, int)
         Texels along each side of the tile, or rows and columns.
     views, lights : str, DirectionSet or array_like (n, 3)
-        See `btfref.numerics.directions.directions`.
+        See `btfref.numerics.sphere.directions.directions`.
     spp : int, optional
         Samples per texel and view, at least 2; each serves all lights. By default 64. With a target error:
         the most that a texel may get, by default 4096.
@@ -66,7 +66,7 @@ def synthesize(
         Called as ``progress(done, total, label)`` after each view.
     estimator : str
         "path", the reference, or "surface", which traces visibility once for all views and lights; see
-        `btfref.sampling.surface_estimator`. `spp` then counts surface points per texel of the tile. Where a
+        `btfref.sampling.surface.estimator`. `spp` then counts surface points per texel of the tile. Where a
         material transmits, masks or mirrors, "path" takes its place and the attribute ``fallback`` says so.
     overwrite : bool
         Replace a store of other settings.
@@ -74,7 +74,7 @@ def synthesize(
         Mitsuba variant; it is part of the settings, since bytes differ between backends.
     target_error : float, optional
         Root mean square of all standard errors, relative to the mean of all values: samples are placed where
-        they are needed for it, see `btfref.sampling.adaptive`. Whether it was reached stands in the store.
+        they are needed for it, see `btfref.sampling.paths.adaptive`. Whether it was reached stands in the store.
     texel_error : float, optional
         Largest relative standard error of a texel of a view (over lights and channels), relative to its mean
         or to a tenth of the whole's. With a target error only; by default no limit.

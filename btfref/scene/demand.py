@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.render.first_hits import MARGIN, Lookups, light_directions
+from btfref.scene.first_hits import MARGIN, Lookups, light_directions
 
 #: Levels of detail by which a footprint may be off.
 LEVEL_MARGIN = 0.01
@@ -67,15 +67,15 @@ class Demand:
         return padded.reshape(rows, side, columns, side).any((1, 3))
 
     def part(self, side=None):
-        """What to synthesize: a `btfref.sampling.part.Part` of pairs, and of tiles as stores have them.
+        """What to synthesize: a `btfref.sampling.store.part.Part` of pairs, and of tiles as stores have them.
 
         Raises
         ------
         InputError
             When nothing is needed.
         """
-        from btfref.sampling.layout import TILE
-        from btfref.sampling.part import Part
+        from btfref.sampling.store.layout import TILE
+        from btfref.sampling.store.part import Part
 
         tiles = np.flatnonzero(self.tiles(side or TILE))
         if not self.pairs.any() or not len(tiles):
@@ -137,9 +137,9 @@ def demand(
     InputError
         For a scene that cannot be read.
     """
-    from btfref.render.camera import film_rays, grid_offsets
-    from btfref.render.loading import loaded
-    from btfref.render.scene import read_scene
+    from btfref.scene.camera import film_rays, grid_offsets
+    from btfref.scene.description import read_scene
+    from btfref.scene.loading import loaded
 
     description = read_scene(scene, parameters, size=size, missing_btf=shape is not None)
     least = max(MARGIN, description.camera.pixel_angle) if margin is None else margin
@@ -191,8 +191,8 @@ def kept_maps(scene, parameters=None, *, lights=True, **settings):
 def choice(one, *, lights=True):
     """What to keep of the file of a :class:`Demand`; see :func:`kept_maps`."""
     from btfref.registry import method
-    from btfref.representations.container import read_info, read_maps
-    from btfref.representations.resident import KINDS
+    from btfref.representations.file.container import read_info, read_maps
+    from btfref.representations.file.resident import KINDS
 
     file = one.file
     made = method(read_info(file)["method"], file=file).representation

@@ -10,9 +10,9 @@ import numpy as np
 from btfref.errors import InputError, MissingDependencyError
 from btfref.numerics.footprint import MODES
 from btfref.platform import prepare_llvm
-from btfref.render import parsing
-from btfref.render.environment import Environment, from_emitter
-from btfref.render.shapes import BtfMaterial, MeshDescription, triangles_of
+from btfref.scene import parsing
+from btfref.scene.environment import Environment, from_emitter
+from btfref.scene.shapes import BtfMaterial, MeshDescription, triangles_of
 
 __all__ = ["BtfMaterial", "Camera", "Light", "MeshDescription", "SceneDescription", "read_scene"]
 
@@ -112,7 +112,7 @@ class SceneDescription:
     lights : tuple of Light
     source : str
         The scene file, for messages.
-    environment : btfref.render.environment.Environment or None
+    environment : btfref.scene.environment.Environment or None
     """
 
     camera: Camera

@@ -1,6 +1,6 @@
 """Environments that ship by construction, by name: what ``-D environment=NAME`` knows beside files.
 
-Pictures have Mitsuba's conventions (:mod:`btfref.render.environment`); the scenes turn their upper edge towards z, and
+Pictures have Mitsuba's conventions (:mod:`btfref.scene.environment`); the scenes turn their upper edge towards z, and
 so does :data:`Z_UP`: directions here are the world's.
 """
 
@@ -12,8 +12,8 @@ from functools import cache
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics import harmonics
-from btfref.render.environment import Environment, bright_texel, constant, sunsky
+from btfref.numerics.sphere import harmonics
+from btfref.scene.environment import Environment, bright_texel, constant, sunsky
 
 #: From the picture's frame, with y up, to the scenes' world with z up.
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])

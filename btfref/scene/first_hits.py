@@ -33,9 +33,9 @@ class Lookups:
         #: Representation whose lookups read texels elsewhere than at their coordinates.
         self.surface = None
         if shape is None:
-            from btfref.numerics import interpolation
+            from btfref.numerics.sphere import interpolation
             from btfref.registry import method
-            from btfref.representations.container import load, read_maps
+            from btfref.representations.file.container import load, read_maps
 
             arrays, meta = read_maps(file, lambda name: name.startswith(("view_", "light_")))
             self.size = tuple(meta["texels"])
@@ -153,7 +153,7 @@ class Lookups:
         self.least_lod = min(self.least_lod, float(lod.min()))
 
     def result(self, from_everywhere, indirect):
-        """Views, lights, pairs, texels, finest level and number of lookups, as of :class:`btfref.demand.Demand`.
+        """Views, lights, pairs, texels, finest level and number of lookups, as of :class:`btfref.scene.demand.Demand`.
 
         All lights where they come from everywhere, and all views where light is reflected on.
         """

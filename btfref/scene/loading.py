@@ -7,7 +7,7 @@ default Gaussian filter mixes pixels and its float16 files round.
 from __future__ import annotations
 
 from btfref.errors import InputError
-from btfref.render import parsing
+from btfref.scene import parsing
 
 
 class loaded:  # noqa: N801 - a context manager that reads as a verb

@@ -221,7 +221,7 @@ def _shipped_environment(parsed, node, name):
     """Give an ``envmap`` the picture of a shipped environment that its file name stands for."""
     import mitsuba as mi
 
-    from btfref.render.environments import NAMES, is_shipped, shipped
+    from btfref.scene.environments import NAMES, is_shipped, shipped
 
     if not is_shipped(name):
         expected = f"a picture, or {', '.join(NAMES)}"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.render.camera import film_rays, grid_offsets
-from btfref.render.loading import loaded
+from btfref.scene.camera import film_rays, grid_offsets
+from btfref.scene.loading import loaded
 
 BACKGROUND, INTERIOR, SILHOUETTE, MESOSTRUCTURE = 0, 1, 2, 3
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics.frames import nearest_rotation
+from btfref.numerics.sphere.frames import nearest_rotation
 
 #: Segments of a full turn of a tessellated sphere, disk or cylinder: chords lie within 4e-5 radii of the
 #: surface.

@@ -102,7 +102,7 @@ def visible_points(scene, description, *, parameters=None, size=None, grid=4, pi
     description : SceneDescription
         Of the same scene.
     parameters, size, grid, pixels
-        As of :func:`btfref.render.approximate.approximate`.
+        As of :func:`btfref.rendering.offline.approximate.approximate`.
 
     Yields
     ------
@@ -113,8 +113,8 @@ def visible_points(scene, description, *, parameters=None, size=None, grid=4, pi
     InputError
         For a shape without a BTF.
     """
-    from btfref.render.camera import film_rays, grid_offsets
-    from btfref.render.loading import loaded
+    from btfref.scene.camera import film_rays, grid_offsets
+    from btfref.scene.loading import loaded
 
     for mesh in description.meshes:
         if mesh.material is None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics.directions import directions, spherical
+from btfref.numerics.sphere.directions import directions, spherical
 from btfref.sampling import SampledBTF
 
 #: Rows and columns where the data do not ask for others.
@@ -94,7 +94,7 @@ def _duplicates(values, rng):
 def _relief(seed):
     """Data that a height field explains: a g-BRDF of smooth bumps 0.1 deep, in two materials, at all its samples."""
     from btfref.numerics.microfacets import isotropic_ndf
-    from btfref.representations.gbrdf_build import from_maps
+    from btfref.representations.gbrdf.build import from_maps
 
     rows, columns = SHAPE
     v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")

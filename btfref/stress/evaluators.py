@@ -62,16 +62,16 @@ def count_malformed(name, representation, lookups):
         As :func:`btfref.conventions.malformed`.
     """
     if name == "glsl":
-        from btfref.render.probe import probe_malformed
+        from btfref.rendering.gl.probe import probe_malformed
 
         return probe_malformed(representation, *lookups.points)
     if name == "numpy float32":
-        from btfref.numerics.precision import computing_in
+        from btfref.precision import computing_in
 
         with computing_in(np.float32):
             return conventions.malformed(*lookups.points)
     dr, mi = _mitsuba()
-    from mitsuba_plugins.lookup import malformed
+    from mitsuba_plugins.lib.lookup import malformed
 
     uv, light, view = (np.ascontiguousarray(a.T) for a in lookups.points)
     with dr.scoped_set_flag(dr.JitFlag.FastMath, name == "drjit"):
@@ -81,7 +81,7 @@ def count_malformed(name, representation, lookups):
 
 
 def _single(representation):
-    from btfref.numerics.precision import computing_in
+    from btfref.precision import computing_in
 
     def evaluate(lookups):
         with computing_in(np.float32):
@@ -91,7 +91,7 @@ def _single(representation):
 
 
 def _glsl(representation):
-    from btfref.render.probe import probe
+    from btfref.rendering.gl.probe import probe
 
     return lambda lookups: probe(representation, *lookups.points, lookups.lod)
 
@@ -119,7 +119,7 @@ def _drjit(path, *, fast):
     levelled = hasattr(bsdf.evaluator, "max_lod")
 
     def evaluate(lookups):
-        from mitsuba_plugins.lookup import valid_directions
+        from mitsuba_plugins.lib.lookup import valid_directions
 
         uv, light, view = (np.ascontiguousarray(a.T) for a in lookups.points)
         with dr.scoped_set_flag(dr.JitFlag.FastMath, fast):

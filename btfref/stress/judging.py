@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from btfref.compare.tolerances import gate_table, tolerance
+from btfref.gates.tolerances import gate_table, tolerance
 
 #: Random points of the box of rounded arguments among which a differing value is looked for.
 NEIGHBOURS = 256

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from btfref.numerics import interpolation
+from btfref.numerics.sphere import interpolation
 
 #: Lookups of a block.
 BLOCK = 4096

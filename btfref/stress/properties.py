@@ -11,9 +11,9 @@ import itertools
 
 import numpy as np
 
-from btfref.compare.tolerances import tolerance
 from btfref.errors import InputError
-from btfref.numerics.directions import DirectionSet, directions
+from btfref.gates.tolerances import tolerance
+from btfref.numerics.sphere.directions import DirectionSet, directions
 from btfref.sampling import SampledBTF
 from btfref.stress.data import make
 from btfref.stress.judging import limit_finding

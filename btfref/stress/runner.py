@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from btfref.compare.tolerances import tolerance
 from btfref.conventions import malformed
 from btfref.errors import InputError
+from btfref.gates.tolerances import tolerance
 from btfref.registry import method, methods
 from btfref.stress import properties
 from btfref.stress.data import DATA, make, scattered

@@ -8,14 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from btfref.compare import compare, json_safe
-from btfref.compare.colour import Display, decode_srgb, fit_display
-from btfref.compare.gates import GateResult, missing_reference
-from btfref.compare.parts import part
-from btfref.compare.waterfall import Picture, waterfall
+from btfref.comparison import compare, json_safe
+from btfref.comparison.parts import part
+from btfref.comparison.waterfall import Picture, waterfall
 from btfref.errors import BtfrefError
-from btfref.scenes import scene_file
-from btfref.validate.cache import code_of, key_of
+from btfref.gates.verdicts import GateResult, missing_reference
+from btfref.images.display import Display, fit_display
+from btfref.numerics.colour import decode_srgb
+from btfref.provenance import code_of
+from btfref.scene.shipped import scene_file
+from btfref.validate.cache import key_of
 from btfref.validate.material import fit_key
 from btfref.validate.matrix import ENVIRONMENTS
 from btfref.validate.pictures import fitted, make_views, shared_settings, views_key
@@ -151,7 +153,7 @@ def _save(path, result):
 
 
 def _cell(cache, spec, settings):
-    from btfref.representations.container import read_info
+    from btfref.representations.file.container import read_info
 
     start = time.perf_counter()
     file, path = fitted(cache, spec, settings), scene_file(spec.scene)
@@ -197,9 +199,9 @@ def _cell(cache, spec, settings):
 
 def _under_deltas(path, spec, views, settings, shared):
     """Chain, reference, picture in real time, gates, facts and parts of stages where nothing is random."""
-    from btfref.render.approximate import approximate
-    from btfref.render.realtime import realtime
-    from btfref.render.reference import render
+    from btfref.rendering.gl.renderer import realtime
+    from btfref.rendering.offline.approximate import approximate
+    from btfref.rendering.offline.reference import render
 
     scene = {name: shared[name] for name in ("parameters", "size")}
     definition = approximate(path, **shared)
@@ -215,9 +217,9 @@ def _under_environment(path, spec, views, settings, shared):
     Its four batches are the stage of the fit as well. Real time approximates here, and its port is a part of that
     stage: GLSL against the same approximation in float64, at pixels drawn at random.
     """
-    from btfref.render.approximate import approximate
-    from btfref.render.converged import converged
-    from btfref.render.realtime import realtime
+    from btfref.rendering.gl.renderer import realtime
+    from btfref.rendering.offline.approximate import approximate
+    from btfref.rendering.offline.converged import converged
 
     image = realtime(path, **shared)
     way = image.meta["environment_path"]

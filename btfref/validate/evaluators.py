@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.compare.comparison import agreement
-from btfref.compare.gates import Measured, judge
+from btfref.comparison.comparison import agreement
+from btfref.gates.verdicts import Measured, judge
 from btfref.validate.probes import hit_allowance, probe_points, unit
 from btfref.validate.sampling import chi_square, surface
 
@@ -41,7 +41,7 @@ def probe_gates(path, *, seed=7):
     list of GateResult
         ``probe.agreement`` of Dr.Jit, then of GLSL, and ``probe.finite``; the detail says whose.
     """
-    from btfref.numerics.directions import DirectionSet
+    from btfref.numerics.sphere.directions import DirectionSet
     from btfref.representations import load
     from btfref.stress.evaluators import definition, port
     from btfref.stress.lookups import Lookups
@@ -123,7 +123,7 @@ def _weights(mi, plugin, uv, w_view, n=1 << 13):
 
 def _plugin(path, **parameters):
     from btfref.platform import prepare_llvm
-    from btfref.render import parsing
+    from btfref.scene import parsing
 
     prepare_llvm()
     import mitsuba as mi

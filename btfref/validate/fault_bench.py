@@ -7,12 +7,12 @@ from functools import cached_property
 
 import numpy as np
 
-from btfref.compare import compare
-from btfref.compare.colour import fit_display
-from btfref.compare.comparison import agreement
-from btfref.compare.gates import Measured, judge
-from btfref.compare.waterfall import Picture, waterfall
-from btfref.scenes import scene_file
+from btfref.comparison import compare
+from btfref.comparison.comparison import agreement
+from btfref.comparison.waterfall import Picture, waterfall
+from btfref.gates.verdicts import Measured, judge
+from btfref.images.display import fit_display
+from btfref.scene.shipped import scene_file
 from btfref.validate.cell import ENVIRONMENT_GATES, GATES
 from btfref.validate.evaluators import sampling_gates
 from btfref.validate.own_renderer import EIGHT_BIT, NOISY
@@ -61,7 +61,7 @@ class Bench:
     @cached_property
     def btf(self):
         """The material: a formula with bumps, 16² texels and 81² directions."""
-        from btfref.numerics.directions import directions
+        from btfref.numerics.sphere.directions import directions
         from btfref.sampling import SampledBTF
         from btfref.stress.data import bumpy_values
 
@@ -90,8 +90,8 @@ class Bench:
 
     def reference(self, subject):
         """Scene, parameters, reference picture and pixel classes."""
-        from btfref.render.classes import pixel_classes
-        from btfref.render.reference import render
+        from btfref.rendering.offline.reference import render
+        from btfref.scene.pixel_classes import pixel_classes
 
         if subject not in self._references:
             scene, size, grid = scene_file(SCENE), SETTINGS["size"], SETTINGS["grid"]
@@ -103,7 +103,7 @@ class Bench:
 
     def picture(self, subject, change=""):
         """Real time against the reference; the fault without a shader is light where nothing is."""
-        from btfref.render.realtime import realtime
+        from btfref.rendering.gl.renderer import realtime
 
         scene, parameters, expected, classes = self.reference(subject)
         image = realtime(scene, parameters=parameters, **SETTINGS).image
@@ -113,9 +113,9 @@ class Bench:
 
     def environment(self, subject, change=""):
         """Real time under an environment against a converged reference."""
-        from btfref.render.classes import pixel_classes
-        from btfref.render.converged import converged
-        from btfref.render.realtime import realtime
+        from btfref.rendering.gl.renderer import realtime
+        from btfref.rendering.offline.converged import converged
+        from btfref.scene.pixel_classes import pixel_classes
 
         parameters = {"btf": str(self.fit(subject)[1]), "lights": "envmap", "tiling": "4"}
         parameters["environment"] = ENVIRONMENTS[subject[0]]
@@ -159,7 +159,7 @@ class Bench:
 
     def probes(self, subject):
         """The shader against the definition, at all levels of detail where there are any."""
-        from btfref.render.probe import probe
+        from btfref.rendering.gl.probe import probe
 
         representation, _ = self.fit(subject)
         rng = np.random.default_rng(11)
@@ -173,9 +173,9 @@ class Bench:
 
     def harmonics(self, subject):
         """The shader under an environment in spherical harmonics against float64."""
-        from btfref.render.environments import shipped
-        from btfref.render.lighting import Lighting
-        from btfref.render.probe import probe_environment
+        from btfref.rendering.environment_light.lighting import Lighting
+        from btfref.rendering.gl.probe import probe_environment
+        from btfref.scene.environments import shipped
 
         rng = np.random.default_rng(12)
         frame = np.linalg.qr(rng.normal(size=(500, 3, 3)))[0]
@@ -192,7 +192,7 @@ class Bench:
 
     def eight_bits(self, subject, change=""):
         """A picture that went through an 8-bit file; the faults are codes taken for radiance, and a pixel's shift."""
-        from btfref.compare.colour import decode_srgb, encode_srgb
+        from btfref.numerics.colour import decode_srgb, encode_srgb
 
         _, _, expected, classes = self.reference(subject)
         shown = np.clip(expected, 0, 1)
@@ -204,7 +204,7 @@ class Bench:
 
     def overflow(self, subject, change=""):
         """Maps as halves on their way to the shader; the fault scales them beyond 65504 and lets it happen."""
-        from btfref.render.probe import probe
+        from btfref.rendering.gl.probe import probe
 
         representation, _ = self.fit(subject)
         if change:

@@ -62,20 +62,20 @@ FAULTS = (
         "half-texel shift",
         PROBE,
         "probes",
-        edit=("lib/texels.glsl", "float(columns), 0.5)", "float(columns), 0.0)"),
+        edit=("lib/lookup/texels.glsl", "float(columns), 0.5)", "float(columns), 0.0)"),
     ),
     Fault("wrong gamma", NOISE_FREE, "picture", edit=(HOST, SUM, "vec4(pow(max(sum, 0.0), vec3(2.2)), 1.0)")),
     Fault(
         "tangent frame transposed",
         NOISE_FREE,
         "picture",
-        edit=("lib/frame.glsl", "return transpose(mat3(", "return (mat3("),
+        edit=("lib/surface/frame.glsl", "return transpose(mat3(", "return (mat3("),
     ),
     Fault(
         "wrong sign in spherical harmonics",
         "environment.agreement.p999",
         "harmonics",
-        edit=("lib/harmonics.glsl", "turn.x * q - turn.y * p;", "turn.x * q + turn.y * p;"),
+        edit=("lib/light/harmonics.glsl", "turn.x * q - turn.y * p;", "turn.x * q + turn.y * p;"),
     ),
     Fault(
         "cluster index off by one",
@@ -127,7 +127,7 @@ FAULTS = (
         "picture",
         "gbrdf",
         (
-            "lib/heightfield.glsl",
+            "lib/surface/heightfield.glsl",
             "vec2(hit.cell) + march.crossed);",
             "vec2(hit.cell) + march.crossed + 1.0);",
         ),
@@ -146,7 +146,7 @@ FAULTS = (
         "image.environment_lights.relative_rmse",
         "environment",
         edit=(
-            "lib/environment_lights.glsl",
+            "lib/light/environment_lights.glsl",
             "table_fetch(environment_lights, 2 * i).xyz * to_world;",
             "(vec3(-1.0, 1.0, 1.0) * table_fetch(environment_lights, 2 * i).xyz) * to_world;",
         ),

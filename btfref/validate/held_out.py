@@ -57,7 +57,7 @@ def held_out_error(fit, btf, *, texels, seed=0):
         their mean (highlights decide the one, what is left the other); ``views``, ``lights``: numbers kept and held
         out.
     """
-    from btfref.numerics.directions import directions
+    from btfref.numerics.sphere.directions import directions
 
     rows, columns = (slice(None, None, max(1, n // texels)) for n in btf.values.shape[2:4])
     values = btf.values[:, :, rows, columns]

@@ -6,7 +6,8 @@ import os
 import shutil
 from functools import lru_cache
 
-from btfref.validate.cache import code_of, key_of
+from btfref.provenance import code_of
+from btfref.validate.cache import key_of
 
 #: Seeds are apart by this: the twin's samples share no random number with the BTF that is fitted.
 TWIN = 1000

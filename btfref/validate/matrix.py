@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, replace
 
 from btfref.errors import InputError
 from btfref.registry import methods
-from btfref.scenes import scene_file
+from btfref.scene.shipped import scene_file
 
 #: Scenes that show a BTF on a shape of their own: flat, curved, folded and seen from both sides.
 SCENES = ("plane", "sphere", "cloth")

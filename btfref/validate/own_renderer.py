@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from btfref.compare import compare, load_image
+from btfref.comparison import compare
 from btfref.errors import InputError
-from btfref.scenes import scene_file
-from btfref.validate.cache import Cache, code_of, key_of
+from btfref.images import load_image
+from btfref.provenance import code_of
+from btfref.scene.shipped import scene_file
+from btfref.validate.cache import Cache, key_of
 
 #: Gates of a picture of linear radiance under delta lights; of one with 8 bits; of one under an environment.
 LINEAR = ("image.noise_free", "image.silhouette", "image.mesostructure", "image.background")
@@ -69,7 +71,7 @@ def reference_of(scene, *, parameters=None, size=None, grid=4, shadows=False, sp
     InputError
         For a scene that cannot be read.
     """
-    from btfref.render.scene import read_scene
+    from btfref.scene.description import read_scene
 
     path, parameters = scene_file(scene), dict(parameters or {})
     description = read_scene(path, parameters, size=size)
@@ -96,8 +98,8 @@ def reference_of(scene, *, parameters=None, size=None, grid=4, shadows=False, sp
 
 
 def _render(path, parameters, size, grid, shadows, spp, delta):
-    from btfref.render.classes import pixel_classes
-    from btfref.render.reference import render
+    from btfref.rendering.offline.reference import render
+    from btfref.scene.pixel_classes import pixel_classes
 
     shared = {"parameters": parameters, "size": size}
     made = {"classes": pixel_classes(path, grid=grid, **shared)}
@@ -128,7 +130,7 @@ def judge_image(image, reference, *, gates=None, flip=True):
 
     Returns
     -------
-    btfref.compare.Comparison
+    btfref.comparison.Comparison
 
     Raises
     ------

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from btfref.scenes import scene_file
-from btfref.validate.cache import code_of, key_of
+from btfref.provenance import code_of
+from btfref.scene.shipped import scene_file
+from btfref.validate.cache import key_of
 from btfref.validate.material import fit_key, load_material, make_fit, make_material, material_key
 from btfref.validate.matrix import ENVIRONMENTS, LIGHTS
 
@@ -72,10 +73,10 @@ def make_views(cache, mesostructure, scene, lights, settings):
 
 def _views(cache, mesostructure, scene, lights, settings):
     from btfref.registry import method
-    from btfref.render.approximate import approximate
-    from btfref.render.classes import pixel_classes
-    from btfref.render.exact import render_exact
-    from btfref.render.reference import render
+    from btfref.rendering.offline.approximate import approximate
+    from btfref.rendering.offline.exact import render_exact
+    from btfref.rendering.offline.reference import render
+    from btfref.scene.pixel_classes import pixel_classes
 
     stores = make_material(cache, mesostructure, settings)
     carrier = make_carrier(cache, mesostructure, settings)

@@ -11,10 +11,11 @@ from dataclasses import dataclass, field
 from itertools import groupby
 from multiprocessing import get_context
 
-from btfref.compare.comparison import json_safe
-from btfref.compare.gates import missing_reference
+from btfref.comparison.comparison import json_safe
 from btfref.errors import BtfrefError, InputError
-from btfref.validate.cache import Cache, code_of, key_of
+from btfref.gates.verdicts import missing_reference
+from btfref.provenance import code_of
+from btfref.validate.cache import Cache, key_of
 from btfref.validate.cell import CellResult, failed_cell, gate_from, make_cell
 from btfref.validate.held_out import held_out_error
 from btfref.validate.material import fit_key, load_material, make_fit, make_material
@@ -109,7 +110,7 @@ def validate(specs, *, settings=FULL, cache=None, workers=None, progress=None):
     BtfrefError
         When a process dies.
     """
-    from btfref.versions import versions
+    from btfref.provenance import versions
 
     specs = sorted(set(specs))
     if not specs:
@@ -238,7 +239,7 @@ def _method_job(root, specs, settings):
 def _checks(cache, spec, file, settings):
     """Agreement of the evaluators, sampling, and held-out directions of a method; cached."""
     from btfref.registry import method
-    from btfref.representations.container import read_info
+    from btfref.representations.file.container import read_info
     from btfref.validate.evaluators import probe_gates, sampling_gates
 
     key = key_of(

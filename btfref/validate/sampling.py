@@ -7,7 +7,7 @@ from contextlib import chdir
 
 import numpy as np
 
-from btfref.compare.tolerances import tolerance
+from btfref.gates.tolerances import tolerance
 
 #: Cells of the test's table are integrated with this many intervals a side: densities jump at the borders of their own
 #: cells. With 16, four million samples of a sharp material (`svd` of the rings) tell the integral from the density.

@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from btfref.compare.tolerances import gate_table, limits
 from btfref.errors import BtfrefError
+from btfref.gates.tolerances import gate_table, limits
 from btfref.platform import shader_directory
 from btfref.validate.fault_bench import Bench
 from btfref.validate.faults import FAULTS
@@ -107,7 +107,7 @@ def edited_shader(folder, file, right, wrong):
     BtfrefError
         The text is not there, or there more than once.
     """
-    from btfref.render import gl
+    from btfref.rendering.gl import device
 
     text = (shader_directory() / file).read_text("utf-8")
     if text.count(right) != 1:
@@ -115,17 +115,17 @@ def edited_shader(folder, file, right, wrong):
     target = Path(folder) / file
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_text(text.replace(right, wrong), "utf-8")
-    shipped = gl.shader_file
+    shipped = device.shader_file
 
     def faulty(rep):
         shader, directories = shipped(rep)
         return shader, [Path(folder), *directories]
 
-    gl.shader_file = faulty
+    device.shader_file = faulty
     try:
         yield
     finally:
-        gl.shader_file = shipped
+        device.shader_file = shipped
 
 
 def used_gates():

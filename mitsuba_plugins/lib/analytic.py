@@ -1,6 +1,6 @@
 """Dr.Jit ports of what the methods share that store functions of the light.
 
-See :mod:`btfref.representations.analytic` and :mod:`btfref.numerics.powers`.
+See :mod:`btfref.representations.analytic.light_functions` and :mod:`btfref.numerics.powers`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _NEAR_ONE = 0.29
 
 
 def held(w, edge):
-    """As :func:`btfref.representations.analytic.held`: the raised direction and the fade."""
+    """As :func:`btfref.representations.analytic.light_functions.held`: the raised direction and the fade."""
     if edge <= 0:
         return w, mi.Float(1)
     below = w.z < edge
@@ -65,7 +65,7 @@ def _from_log(log, exponent, there):
 
 
 def parabolic_axis(s, t):
-    """As :func:`btfref.representations.rf_lobes.parabolic_axis`."""
+    """As :func:`btfref.representations.analytic.rf_lobes.parabolic_axis`."""
     r2 = dr.fma(s, s, t * t)
     scale = 1 / (1 + r2)
     return mi.Vector3f(2 * s * scale, 2 * t * scale, (1 - r2) * scale)

@@ -2,7 +2,7 @@
 
 Stock integrators compute no texture derivatives (``path`` drops ray differentials, and JIT variants find the fields
 present but zero), so the pixel's cone stands in for them: its angle and apex come from the scene's camera, which
-:mod:`btfref.render.reference` sets through ``mi.traverse``, or from the material's parameters.
+:mod:`btfref.rendering.offline.reference` sets through ``mi.traverse``, or from the material's parameters.
 """
 
 from __future__ import annotations

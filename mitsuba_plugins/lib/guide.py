@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from btfref.numerics import interpolation
+from btfref.numerics.sphere import interpolation
 
 #: Cells in sin² θ and in φ. Finer cells would resolve more than directions 15° apart contain.
 N_RADIAL, N_AZIMUTH = 8, 32
@@ -180,7 +180,7 @@ class LightGuide:
         """Index of the tables of the group of the texel, of the level nearest to ``lod`` where there are levels."""
         if self.single_group:
             return mi.UInt32(0)
-        from mitsuba_plugins.lookup import texel_stencil
+        from mitsuba_plugins.lib.lookup import texel_stencil
 
         if lod is None or len(self.shapes) == 1:
             (texel,), _ = texel_stencil(uv, self.shapes[0], "nearest")

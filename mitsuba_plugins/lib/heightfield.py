@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_plugins.lookup import texel_position
+from mitsuba_plugins.lib.lookup import texel_position
 
 #: Stands for "never": far beyond every ray parameter, which is at most 1.
 _NEVER = 1e30

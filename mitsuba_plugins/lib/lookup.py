@@ -1,4 +1,4 @@
-"""Dr.Jit ports of the shared lookups: directions and texels; their tables are in :mod:`mitsuba_plugins.tables`.
+"""Dr.Jit ports of the shared lookups: directions and texels; their tables are in :mod:`mitsuba_plugins.lib.tables`.
 
 Everything here is recorded, never executed per sample: no data-dependent Python control flow.
 """
@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from btfref.conventions import LEAST_Z, SQUARED_LENGTHS
-from btfref.numerics.interpolation import MISSING
+from btfref.numerics.sphere.interpolation import MISSING
 
 #: The largest finite float32.
 LARGEST = float(np.finfo(np.float32).max)
@@ -111,7 +111,7 @@ class Neighbour:
 
 
 class RingTable:
-    """Port of :class:`btfref.numerics.interpolation.RingInterpolation`."""
+    """Port of :class:`btfref.numerics.sphere.interpolation.RingInterpolation`."""
 
     def __init__(self, rings):
         self.rings = np.asarray(rings, float)
@@ -177,7 +177,7 @@ class RingTable:
 
 
 class TriangleTable:
-    """Port of :class:`btfref.numerics.interpolation.TriangleInterpolation`."""
+    """Port of :class:`btfref.numerics.sphere.interpolation.TriangleInterpolation`."""
 
     def __init__(self, triangles, cells):
         self.n_triangles, self.n_cells = len(triangles), len(cells)
@@ -239,7 +239,7 @@ class TriangleTable:
 
 
 class ResidentTable:
-    """Port of :class:`btfref.numerics.interpolation.ResidentInterpolation`: what is not kept gives no number."""
+    """Port of :class:`btfref.numerics.sphere.interpolation.ResidentInterpolation`: what is not kept gives no number."""
 
     def __init__(self, inner, slots):
         self.inner, self._table = inner, np.ascontiguousarray(slots[:, 0])

@@ -7,9 +7,9 @@ import mitsuba as mi
 import numpy as np
 
 from btfref.conventions import LUMINANCE
-from btfref.numerics.parabolic import texel_centres, texel_solid_angles
-from mitsuba_plugins.guide import alias_tables, drawn
-from mitsuba_plugins.proposals import COSINE_SHARE, folded
+from btfref.numerics.sphere.parabolic import texel_centres, texel_solid_angles
+from mitsuba_plugins.lib.guide import alias_tables, drawn
+from mitsuba_plugins.lib.proposals import COSINE_SHARE, folded
 
 #: Cosine between view and half vector down to which light is the view's reflection: its density, p(h) / (4 k·h), is
 #: singular at 0. Below it, ever more half vectors are directions of light themselves.

@@ -1,4 +1,4 @@
-"""Dr.Jit ports of parabolic maps (:mod:`btfref.numerics.parabolic`) and of half and difference vectors."""
+"""Dr.Jit ports of parabolic maps (:mod:`btfref.numerics.sphere.parabolic`) and of half and difference vectors."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from btfref.numerics.halfway import LENGTHEN, SHORT
-from btfref.representations.factored import raised
-from mitsuba_plugins.tables import HALF_LIMIT, HALF_SCALE, HALF_SHIFT, read_packets, wide, widened
+from btfref.numerics.sphere.halfway import LENGTHEN, SHORT
+from btfref.representations.factored.definition import raised
+from mitsuba_plugins.lib.tables import HALF_LIMIT, HALF_SCALE, HALF_SHIFT, read_packets, wide, widened
 
 
 def half_sum(w_light, w_view):
@@ -18,7 +18,7 @@ def half_sum(w_light, w_view):
 
 
 def half_difference(w_light, w_view):
-    """As :func:`btfref.numerics.halfway.half_difference`."""
+    """As :func:`btfref.numerics.sphere.halfway.half_difference`."""
     h = half_sum(w_light, w_view)
     length = dr.norm(h)
     h = dr.select(length > 0, h / length, mi.Vector3f(0, 0, 1))
@@ -29,7 +29,7 @@ def half_difference(w_light, w_view):
 
 
 def bilinear_stencil(w, n):
-    """As :func:`btfref.numerics.parabolic.bilinear_stencil`: lists of four indices and weights."""
+    """As :func:`btfref.numerics.sphere.parabolic.bilinear_stencil`: lists of four indices and weights."""
     scale = dr.norm(w) + w.z
     scale = dr.select(scale > 0, 1 / scale, 0)
     index, fraction = [], []

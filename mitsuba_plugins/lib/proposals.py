@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_plugins.analytic import safe_power
+from mitsuba_plugins.lib.analytic import safe_power
 
 #: Least share of cosine sampling beside lobes: lights below the outermost measured ones are held, which the lobes
 #: themselves do not follow, and bounds the weight of a sample by 10 times that of cosine sampling.

@@ -1,8 +1,8 @@
 // Provides btf_environment of Lafortune lobes times a view-dependent factor: radiance under a prefiltered environment.
-// Expects what representations/lafortune_lut.glsl and lib/environment.glsl expect.
+// Expects what representations/lafortune_lut.glsl and lib/light/environment.glsl expect.
 
 #include "representations/lafortune_lut.glsl"
-#include "lib/lafortune_light.glsl"
+#include "lib/light/lafortune_light.glsl"
 
 // to_world takes local directions to world space.
 vec3 btf_prefiltered(vec2 uv, vec3 w_view, mat3 to_world) {
@@ -25,4 +25,4 @@ vec3 btf_prefiltered(vec2 uv, vec3 w_view, mat3 to_world) {
     return sum;
 }
 
-#include "lib/split_environment.glsl"
+#include "lib/light/split_environment.glsl"

@@ -1,8 +1,8 @@
 // Provides btf_environment of local PCA: radiance under an environment in spherical harmonics.
-// Expects what lib/harmonics.glsl expects, eigen_harmonics [cluster, view, order^2, packet], and lpca's texel maps.
+// Expects what lib/light/harmonics.glsl expects, eigen_harmonics [cluster, view, order^2, packet], and lpca's texel maps.
 
 #include "representations/lpca.glsl"
-#include "lib/harmonics.glsl"
+#include "lib/light/harmonics.glsl"
 
 uniform sampler2DArray eigen_harmonics;
 

@@ -2,7 +2,7 @@
 // Expects the samplers below, TRANSFER_*, lpca's texel maps, and the triangle and bin that the host sets.
 
 #include "representations/lpca.glsl"
-#include "lib/parabolic_maps.glsl"
+#include "lib/lookup/parabolic_maps.glsl"
 
 uniform sampler2DArray transfer_products;  // [channel, side, matrix cluster, j, cluster, row, column, m] floats or codes
 uniform sampler2DArray transfer_corners;   // [triangle, corner]: cluster, weights from j = 1 on

@@ -1,8 +1,8 @@
 // Provides btf_environment of reflectance fields as cosine lobes: radiance under a prefiltered environment.
-// Expects what representations/rf_lobes.glsl and lib/environment.glsl expect.
+// Expects what representations/rf_lobes.glsl and lib/light/environment.glsl expect.
 
 #include "representations/rf_lobes.glsl"
-#include "lib/environment.glsl"
+#include "lib/light/environment.glsl"
 
 // to_world takes local directions to world space.
 vec3 btf_prefiltered(vec2 uv, vec3 w_view, mat3 to_world) {
@@ -36,4 +36,4 @@ vec3 btf_prefiltered(vec2 uv, vec3 w_view, mat3 to_world) {
     return sum;
 }
 
-#include "lib/split_environment.glsl"
+#include "lib/light/split_environment.glsl"

@@ -2,7 +2,7 @@
 // Expects what representations/rf_poly.glsl expects, and environment_moments [18, size, size, 3].
 
 #include "representations/rf_poly.glsl"
-#include "lib/sphere_maps.glsl"
+#include "lib/light/sphere_maps.glsl"
 
 uniform sampler2DArray environment_moments;
 
@@ -49,4 +49,4 @@ vec3 btf_prefiltered(vec2 uv, vec3 w_view, mat3 to_world) {
     return sum;
 }
 
-#include "lib/split_environment.glsl"
+#include "lib/light/split_environment.glsl"

@@ -1,10 +1,10 @@
 // Provides the radiance towards the camera under directional and point lights and an environment, without cast shadows.
 // Expects a representation, the tables of hosts/mesh.vert, the camera's rays, the lights and the material.
 
-#include "lib/frame.glsl"
-#include "lib/lights.glsl"
-#include "lib/lod.glsl"
-#include "lib/triangle_table.glsl"
+#include "lib/surface/frame.glsl"
+#include "lib/light/lights.glsl"
+#include "lib/surface/lod.glsl"
+#include "lib/surface/triangle_table.glsl"
 #include "representation"
 #include "environment"
 

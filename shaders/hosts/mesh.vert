@@ -1,7 +1,7 @@
 // Provides the projected vertices of a mesh, without vertex buffers: vertex v is corner v % 3 of triangle v / 3.
-// Expects the triangle table of lib/triangle_table.glsl and world_to_clip, the jittered projection; the bins' triangles if any.
+// Expects the triangle table of lib/surface/triangle_table.glsl and world_to_clip, the jittered projection; the bins' triangles if any.
 
-#include "lib/triangle_table.glsl"
+#include "lib/surface/triangle_table.glsl"
 
 uniform sampler2DArray triangles;
 uniform mat4 world_to_clip;

@@ -1,7 +1,7 @@
 // Provides one value of B for each vertex, through transform feedback, and whether the lookup is malformed.
 // Expects a representation; attributes uv, w_light, w_view (local frame, unit length) and lod.
 
-#include "lib/malformed.glsl"
+#include "lib/lookup/malformed.glsl"
 #include "representation"
 
 in vec2 uv;

@@ -4,10 +4,10 @@
 // Suykens et al. 2003, eq. 3: B = (sum over k of S_k P_k(l) R_k(v)) * (sum over j of T_j Q_j(h) D_j(d)). The index holds a
 // prototype for each term of P, then of Q, R and D; with one term each these are the paper's r, g and b.
 
-#include "lib/directions.glsl"
-#include "lib/halfway.glsl"
-#include "lib/parabolic_maps.glsl"
-#include "lib/texels.glsl"
+#include "lib/lookup/directions.glsl"
+#include "lib/lookup/halfway.glsl"
+#include "lib/lookup/parabolic_maps.glsl"
+#include "lib/lookup/texels.glsl"
 
 uniform sampler2DArray factor_p;
 uniform sampler2DArray factor_q;

@@ -3,10 +3,10 @@
 
 // Menzel and Guthe 2009, eq. 1 and 2, times the light's cosine:
 // B = c_d/pi (k1.n) + c_s p(h) F(k1.h) k1.n / (k1.n + k2.n - (k1.n)(k2.n)), F(u) = r0 + (1 - r0)(1 - u)^5.
-#include "lib/directions.glsl"
-#include "lib/halfway.glsl"
-#include "lib/heightfield.glsl"
-#include "lib/parabolic_maps.glsl"
+#include "lib/lookup/directions.glsl"
+#include "lib/lookup/halfway.glsl"
+#include "lib/surface/heightfield.glsl"
+#include "lib/lookup/parabolic_maps.glsl"
 
 uniform sampler2DArray surface;
 uniform sampler2DArray colour;

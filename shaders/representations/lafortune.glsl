@@ -1,10 +1,10 @@
 // Provides btf_eval of Lafortune lobes per texel.
-// Expects the maps of lib/lafortune.glsl, LIGHT_EDGE, VIEW_EDGE and the direction tables.
+// Expects the maps of lib/numbers/lafortune.glsl, LIGHT_EDGE, VIEW_EDGE and the direction tables.
 
-#include "lib/directions.glsl"
-#include "lib/hold.glsl"
-#include "lib/lafortune.glsl"
-#include "lib/texels.glsl"
+#include "lib/lookup/directions.glsl"
+#include "lib/lookup/hold.glsl"
+#include "lib/numbers/lafortune.glsl"
+#include "lib/lookup/texels.glsl"
 
 vec3 btf_eval(vec2 uv, vec3 w_light, vec3 w_view, float lod) {
     if (!directions_valid(w_light, w_view)) {

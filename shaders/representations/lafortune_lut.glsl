@@ -1,10 +1,10 @@
 // Provides btf_eval of Lafortune lobes times a view-dependent factor per texel.
-// Expects the maps of lib/lafortune.glsl, factor [row, column, view], LIGHT_EDGE, VIEW_EDGE and the direction tables.
+// Expects the maps of lib/numbers/lafortune.glsl, factor [row, column, view], LIGHT_EDGE, VIEW_EDGE and the direction tables.
 
-#include "lib/directions.glsl"
-#include "lib/hold.glsl"
-#include "lib/lafortune.glsl"
-#include "lib/texels.glsl"
+#include "lib/lookup/directions.glsl"
+#include "lib/lookup/hold.glsl"
+#include "lib/numbers/lafortune.glsl"
+#include "lib/lookup/texels.glsl"
 
 uniform sampler2DArray factor;
 

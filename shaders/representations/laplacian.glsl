@@ -1,12 +1,12 @@
 // Provides btf_eval of a Laplacian pyramid: the mean and the levels from floor(lod) on; finer ones are not fetched.
 // Expects basis [level, view, light, component], weights [texels of all levels, component], mean or phong.
 
-#include "lib/careful_sum.glsl"
-#include "lib/directions.glsl"
-#include "lib/footprint.glsl"
-#include "lib/hold.glsl"
-#include "lib/powers.glsl"
-#include "lib/texels.glsl"
+#include "lib/numbers/careful_sum.glsl"
+#include "lib/lookup/directions.glsl"
+#include "lib/surface/footprint.glsl"
+#include "lib/lookup/hold.glsl"
+#include "lib/numbers/powers.glsl"
+#include "lib/lookup/texels.glsl"
 
 uniform sampler2DArray basis;
 uniform sampler2DArray weights;

@@ -4,9 +4,9 @@
 // Mueller, Meseth, Klein 2004: B_x = mean_k(x) + sum over i of weight_i E_(i,k(x)); entry 0 of a packet is the mean.
 #define PACKET_COLOURS (1 + WEIGHTS_DIM2)
 
-#include "lib/directions.glsl"
-#include "lib/packets.glsl"
-#include "lib/texels.glsl"
+#include "lib/lookup/directions.glsl"
+#include "lib/lookup/packets.glsl"
+#include "lib/lookup/texels.glsl"
 
 uniform sampler2DArray basis;
 uniform sampler2DArray weights;

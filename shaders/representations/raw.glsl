@@ -1,9 +1,9 @@
 // Provides btf_eval of the tabulated BTF.
-// Expects values [row, column, view, light, 4] and the direction tables of lib/directions.glsl.
+// Expects values [row, column, view, light, 4] and the direction tables of lib/lookup/directions.glsl.
 
-#include "lib/directions.glsl"
-#include "lib/table.glsl"
-#include "lib/texels.glsl"
+#include "lib/lookup/directions.glsl"
+#include "lib/lookup/table.glsl"
+#include "lib/lookup/texels.glsl"
 
 uniform sampler2DArray values;
 

@@ -1,11 +1,11 @@
 // Provides btf_eval of reflectance fields as cosine lobes of the light.
 // Expects lobes [row, column, view, 4 N_LOBES], colour [row, column, 4], LIGHT_EDGE and the direction tables.
 
-#include "lib/directions.glsl"
-#include "lib/hold.glsl"
-#include "lib/parabolic.glsl"
-#include "lib/powers.glsl"
-#include "lib/texels.glsl"
+#include "lib/lookup/directions.glsl"
+#include "lib/lookup/hold.glsl"
+#include "lib/lookup/parabolic.glsl"
+#include "lib/numbers/powers.glsl"
+#include "lib/lookup/texels.glsl"
 
 uniform sampler2DArray lobes;
 uniform sampler2DArray colour;

@@ -1,9 +1,9 @@
 // Provides btf_eval of reflectance fields as biquadratic polynomials of the light.
 // Expects polynomial [row, column, view, 6], chroma [row, column, 3], LIGHT_EDGE and the direction tables.
 
-#include "lib/directions.glsl"
-#include "lib/hold.glsl"
-#include "lib/texels.glsl"
+#include "lib/lookup/directions.glsl"
+#include "lib/lookup/hold.glsl"
+#include "lib/lookup/texels.glsl"
 
 uniform sampler2DArray polynomial;
 uniform sampler2DArray chroma;

@@ -1,11 +1,11 @@
 // Provides btf_eval of the truncated singular value decomposition, B = sum over c of weights_c(x) basis_c(v, l).
-// Expects basis [view, light, packet], weights [row, column, component], the tables of lib/directions.glsl.
+// Expects basis [view, light, packet], weights [row, column, component], the tables of lib/lookup/directions.glsl.
 
 #define PACKET_COLOURS WEIGHTS_DIM2
 
-#include "lib/directions.glsl"
-#include "lib/packets.glsl"
-#include "lib/texels.glsl"
+#include "lib/lookup/directions.glsl"
+#include "lib/lookup/packets.glsl"
+#include "lib/lookup/texels.glsl"
 
 uniform sampler2DArray basis;
 uniform sampler2DArray weights;

@@ -5,16 +5,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from btfref.compare import compare
+from btfref.comparison import compare
 from btfref.registry import methods
-from btfref.render.approximate import approximate
-from btfref.render.classes import pixel_classes
-from btfref.render.exact import render_exact
-from btfref.render.geometry import geometry_classes, render_geometry
-from btfref.render.reference import render
+from btfref.rendering.offline.approximate import approximate
+from btfref.rendering.offline.exact import render_exact
+from btfref.rendering.offline.geometry import geometry_classes, render_geometry
+from btfref.rendering.offline.reference import render
 from btfref.representations import save
 from btfref.sampling.synthesis import synthesize
-from btfref.scenes import scene_file
+from btfref.scene.pixel_classes import pixel_classes
+from btfref.scene.shipped import scene_file
 
 SIZE = (40, 40)
 

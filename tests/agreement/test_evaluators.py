@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from probes import hit_allowance, probe_points
 
-from btfref.compare.comparison import agreement
+from btfref.comparison.comparison import agreement
 from btfref.conventions import FILTER_TYPES
 from btfref.registry import methods
 
@@ -63,7 +63,7 @@ def test_drjit_agrees(case, llvm):
 
 def test_glsl_agrees(case, need):
     need("gl")
-    from btfref.render.probe import probe
+    from btfref.rendering.gl.probe import probe
 
     representation, _, _, points = case
     assert_agrees(probe(representation, *points), representation, points)
@@ -84,7 +84,7 @@ def test_invalid_lookups_are_zero_everywhere(key, fits, llvm, need):
     import drjit as dr
 
     import mitsuba_plugins
-    from btfref.render.probe import probe
+    from btfref.rendering.gl.probe import probe
 
     need("gl")
     mi = llvm

@@ -5,7 +5,7 @@ import pytest
 from oracle import oracle_btf
 from probes import probe_points
 
-from btfref.compare.comparison import agreement
+from btfref.comparison.comparison import agreement
 from btfref.registry import methods
 from btfref.representations import save
 
@@ -27,7 +27,7 @@ def test_every_form_agrees(form, llvm, need, tmp_path):
     import drjit as dr
 
     import mitsuba_plugins
-    from btfref.render.probe import probe
+    from btfref.rendering.gl.probe import probe
 
     need("gl")
     key, parameters = FORMS[form]

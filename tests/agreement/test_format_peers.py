@@ -21,9 +21,10 @@ import formats_material as material
 import numpy as np
 import pytest
 
-from btfref.compare import tolerance
-from btfref.formats import export_btf, import_btf, open_source, radiance
-from btfref.numerics.directions import directions
+from btfref.formats import export_btf, import_btf, open_source
+from btfref.gates import tolerance
+from btfref.images import radiance
+from btfref.numerics.sphere.directions import directions
 from btfref.sampling import SampledBTF
 
 EXTRACT = """

@@ -7,11 +7,11 @@ import pytest
 from oracle import KINDS
 from probes import hit_allowance
 
-from btfref.compare import agreement
-from btfref.numerics.directions import directions
+from btfref.comparison import agreement
+from btfref.numerics.sphere.directions import directions
 from btfref.registry import methods
-from btfref.render import composer, gl
-from btfref.render.probe import broadcast_points, probe
+from btfref.rendering.gl import composer, device
+from btfref.rendering.gl.probe import broadcast_points, probe
 
 #: Sets of directions: test_evaluators.py has the others.
 SETS = ("shifted", "triangles")
@@ -93,14 +93,14 @@ def test_a_lost_piece_fails_the_probe(need, rng, fits, tmp_path, monkeypatch):
     need("gl")
     from btfref.platform import shader_directory
 
-    text = (shader_directory() / "lib/angles.glsl").read_text()
+    text = (shader_directory() / "lib/lookup/angles.glsl").read_text()
     coarse = text.replace("return x + x * z * p;", "return atan(x) + 3e-6 * x;")
     assert coarse != text
     (tmp_path / "lib").mkdir()
-    (tmp_path / "lib/angles.glsl").write_text(coarse)
+    (tmp_path / "lib/lookup/angles.glsl").write_text(coarse)
     rep = fits("raw")
-    shader, _ = gl.shader_file(rep)
-    monkeypatch.setattr(gl, "shader_file", lambda rep: (shader, [tmp_path]))
+    shader, _ = device.shader_file(rep)
+    monkeypatch.setattr(device, "shader_file", lambda rep: (shader, [tmp_path]))
     uv, w_light, w_view = split(points(rng, *KINDS["ubo81"]))
     found = agreement(probe(rep, uv, w_light, w_view), rep.evaluate(uv, w_light, w_view))
     assert not found.passed
@@ -120,9 +120,9 @@ STAGES = [
 def test_glslang_accepts_every_representation_in_every_host(need, fits, tmp_path, key, kind, target):
     validator = need("glslang")
     rep = fits(key, kind)
-    shader, directories = gl.shader_file(rep)
+    shader, directories = device.shader_file(rep)
     for filter_type in ("bilinear", "nearest"):
-        defines = {**gl.shader_defines(rep, filter_type=filter_type), "N_LIGHTS": 3}
+        defines = {**device.shader_defines(rep, filter_type=filter_type), "N_LIGHTS": 3}
         for pair in STAGES:
             files, sources = [], []
             for name in pair:

@@ -5,12 +5,12 @@ import pytest
 from oracle import oracle_btf
 
 from btfref import registry, representations
-from btfref.compare import compare
+from btfref.comparison import compare
 from btfref.errors import InputError
-from btfref.render.classes import pixel_classes
-from btfref.render.realtime import realtime
-from btfref.render.reference import render
-from btfref.render.scene import read_scene
+from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.offline.reference import render
+from btfref.scene.description import read_scene
+from btfref.scene.pixel_classes import pixel_classes
 
 GRID = 4
 SIZE = (96, 96)
@@ -83,7 +83,7 @@ def test_several_files_texture_transforms_scale_and_both_sides(llvm, tmp_path):
 
 LAMBERT = """// Provides btf_eval of a Lambertian surface.
 // Expects reflectance [1, 4].
-#include "lib/table.glsl"
+#include "lib/lookup/table.glsl"
 uniform sampler2DArray reflectance;
 vec3 btf_eval(vec2 uv, vec3 w_light, vec3 w_view, float lod) {
     return w_light.z > 0.0 && w_view.z > 0.0 ? table_fetch(reflectance, 0).rgb * w_light.z : vec3(0.0);

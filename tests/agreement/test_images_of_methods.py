@@ -5,14 +5,14 @@ from importlib.resources import files
 import pytest
 from oracle import oracle_btf
 
-from btfref.compare import compare
+from btfref.comparison import compare
 from btfref.platform import shader_directory
 from btfref.registry import methods
-from btfref.render import gl
-from btfref.render.classes import pixel_classes
-from btfref.render.realtime import realtime
-from btfref.render.reference import render
+from btfref.rendering.gl import device
+from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.offline.reference import render
 from btfref.representations import save
+from btfref.scene.pixel_classes import pixel_classes
 
 GATES = ("image.noise_free", "image.silhouette", "image.mesostructure", "image.background")
 
@@ -82,7 +82,7 @@ def reference(saved, classes_of):
     def get(key, name, lights, *, grid, size):
         case = key, name, lights, grid, size
         if case not in made:
-            path = files("btfref.scenes").joinpath(f"{name}.xml")
+            path = files("btfref.scene.shipped").joinpath(f"{name}.xml")
             parameters = {"btf": saved(key), "lights": lights, "tiling": "4"}
             image = render(path, parameters=parameters, noise_free=grid, shadows=False, size=size)
             made[case] = path, parameters, image, classes_of(name, path, parameters, grid, size)
@@ -122,9 +122,9 @@ FAULTS = {
         "btf_eval(uv, w_view, w_light",
     ),
     "v flipped": ("hosts/mesh.frag", "btf_eval(uv,", "btf_eval(vec2(uv.x, -uv.y),"),
-    "half-texel shift": ("lib/texels.glsl", "float(columns), 0.5)", "float(columns), 0.0)"),
+    "half-texel shift": ("lib/lookup/texels.glsl", "float(columns), 0.5)", "float(columns), 0.0)"),
     "wrong gamma": ("hosts/mesh.frag", "vec4(scale * sum, 1.0)", "vec4(pow(max(sum, 0.0), vec3(2.2)), 1.0)"),
-    "tangent frame transposed": ("lib/frame.glsl", "return transpose(mat3(", "return (mat3("),
+    "tangent frame transposed": ("lib/surface/frame.glsl", "return transpose(mat3(", "return (mat3("),
 }
 
 
@@ -145,13 +145,13 @@ def test_injected_faults_are_caught_by_the_noise_free_gate(reference, tmp_path, 
     assert text.count(right) == 1
     (tmp_path / file).parent.mkdir(parents=True)
     (tmp_path / file).write_text(text.replace(right, wrong))
-    shipped = gl.shader_file
+    shipped = device.shader_file
 
     def faulty(rep):
         shader, directories = shipped(rep)
         return shader, [tmp_path, *directories]
 
-    monkeypatch.setattr(gl, "shader_file", faulty)
+    monkeypatch.setattr(device, "shader_file", faulty)
     path, parameters, expected, classes = reference(key, *ONE, **QUICK)
     image = realtime(path, parameters=parameters, **QUICK)
     comparison = compare(image, expected, classes=classes, gate="image.noise_free", flip=False)

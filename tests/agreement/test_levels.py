@@ -5,16 +5,17 @@ import pytest
 from oracle import SHAPE
 from probes import probe_points
 
-from btfref.compare import compare
-from btfref.compare.comparison import agreement
-from btfref.compare.tolerances import tolerance
+from btfref.comparison import compare
+from btfref.comparison.comparison import agreement
+from btfref.gates.tolerances import tolerance
 from btfref.numerics.footprint import cone_footprint, probe_weight
-from btfref.render.classes import pixel_classes
-from btfref.render.realtime import realtime
-from btfref.render.reference import render
-from btfref.render.scene import read_scene
-from btfref.representations import laplacian, save
-from btfref.scenes import scene_file
+from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.offline.reference import render
+from btfref.representations import save
+from btfref.representations.laplacian import definition as laplacian
+from btfref.scene.description import read_scene
+from btfref.scene.pixel_classes import pixel_classes
+from btfref.scene.shipped import scene_file
 
 LODS = (0.0, 0.37, 2.5, 4.0)
 SETTINGS = {
@@ -76,7 +77,7 @@ def plugin(mi, path, **parameters):
 @pytest.mark.parametrize("lod", LODS)
 @pytest.mark.parametrize("name", SETTINGS)
 def test_all_evaluators_agree_at_any_level(made, fits, llvm, need, name, lod):
-    from btfref.render.probe import probe
+    from btfref.rendering.gl.probe import probe
 
     need("gl")
     mi = llvm
@@ -93,7 +94,7 @@ def test_all_evaluators_agree_at_any_level(made, fits, llvm, need, name, lod):
 
 
 def test_each_lookup_has_its_own_level(made, fits, need, rng):
-    from btfref.render.probe import probe
+    from btfref.rendering.gl.probe import probe
 
     need("gl")
     representation, _ = made("default")

@@ -11,11 +11,11 @@ import pytest
 from schemas import assert_follows_schema
 
 from btfref.cli import main
-from btfref.compare import save_image
-from btfref.compare.images import load_image
 from btfref.errors import InputError
-from btfref.render.realtime import realtime
-from btfref.scenes import scene_file
+from btfref.images import save_image
+from btfref.images.files import load_image
+from btfref.rendering.gl.renderer import realtime
+from btfref.scene.shipped import scene_file
 from btfref.testing import assert_matches_reference
 from btfref.validate.own_renderer import Reference, judge_image, reference_of, representation_for
 
@@ -37,7 +37,7 @@ def theirs(fits, tmp_path_factory):
     save_image(folder / "my.exr", image)
     save_image(folder / "wrong.exr", image[::-1].copy())
     shown = np.clip(image, 0, 1)
-    from btfref.compare import Display
+    from btfref.comparison import Display
 
     save_image(folder / "my.png", shown, display=Display())
     return folder, fits.path("lpca"), folder / "cache"
@@ -118,7 +118,7 @@ def test_a_noisy_reference_is_judged_by_equivalence(rng):
 
 PROJECT = """
 from btfref.testing import assert_matches_reference
-from btfref.compare import load_image
+from btfref.images import load_image
 
 SCENE = dict(btf={path!r}, lights="points2", cache={cache!r})
 

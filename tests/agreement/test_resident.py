@@ -10,14 +10,14 @@ from probes import hemisphere
 from btfref.cli import main
 from btfref.conventions import texel_stencil
 from btfref.errors import InputError
-from btfref.numerics import interpolation
+from btfref.numerics.sphere import interpolation
 from btfref.registry import methods
-from btfref.render.probe import probe
-from btfref.render.realtime import realtime
+from btfref.rendering.gl.probe import probe
+from btfref.rendering.gl.renderer import realtime
 from btfref.representations import load, save
-from btfref.representations.exr_rows import RowReader
-from btfref.representations.gbrdf import texel_weights
-from btfref.representations.resident import KINDS, SLOTS, keeping, with_views
+from btfref.representations.file.resident import KINDS, SLOTS, keeping, with_views
+from btfref.representations.file.rows import RowReader
+from btfref.representations.gbrdf.definition import texel_weights
 
 CASES = [
     (key, kind)
@@ -25,7 +25,7 @@ CASES = [
     for kind, axes in KINDS.items()
     if getattr(row.representation, axes, None)
 ]
-PLANE = files("btfref.scenes").joinpath("plane.xml")
+PLANE = files("btfref.scene.shipped").joinpath("plane.xml")
 
 
 def lookups(rng, representation, kind, chosen, n=4000):

@@ -7,12 +7,13 @@ import pytest
 from oracle import oracle_btf
 from probes import hemisphere
 
-from btfref.compare import compare
-from btfref.compare.tolerances import tolerance
-from btfref.render.classes import pixel_classes
-from btfref.render.realtime import realtime
-from btfref.render.reference import render
-from btfref.representations import cmf, save
+from btfref.comparison import compare
+from btfref.gates.tolerances import tolerance
+from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.offline.reference import render
+from btfref.representations import save
+from btfref.representations.factored import cmf
+from btfref.scene.pixel_classes import pixel_classes
 
 GRID, SIZE = 2, (64, 64)
 
@@ -42,7 +43,7 @@ def test_no_slice_leaks_into_another(storage, llvm, need, rng, tmp_path):
     import drjit as dr
 
     import mitsuba_plugins
-    from btfref.render.probe import probe
+    from btfref.rendering.gl.probe import probe
 
     need("gl")
     fitted = alternating(fit(oracle_btf((6, 6)), clusters=8, storage=storage))

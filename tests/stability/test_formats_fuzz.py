@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from btfref.errors import InputError
-from btfref.formats import import_btf, open_source, pictures, radiance
+from btfref.formats import import_btf, open_source
+from btfref.images import decoding, radiance
 from btfref.numerics.colour import RGB_TO_XYZ
 from btfref.sampling import open_store
 
@@ -53,7 +54,7 @@ def exr_picture(names):
     def make(image):
         with tempfile.NamedTemporaryFile(suffix=".exr") as stream:
             planes = {name: image[..., c % 3] for c, name in enumerate(names)}
-            pictures.write_exr(planes, stream.name)
+            decoding.write_exr(planes, stream.name)
             return stream.read()
 
     return make
@@ -194,9 +195,9 @@ def run(cases, tmp_path, seed, every):
             try:
                 if name in PICTURES:
                     try:
-                        shape = pictures.header(changed, path)[1:3]
+                        shape = decoding.header(changed, path)[1:3]
                         if shape[0] * shape[1] < 1 << 20:
-                            pixels, channels = pictures.decode(changed, path, shape)
+                            pixels, channels = decoding.decode(changed, path, shape)
                             assert pixels.shape == (*shape, len(channels))
                         ok = True
                     except InputError:
@@ -228,7 +229,7 @@ def test_the_seeds_are_good(tmp_path):
         (tmp_path / name).write_bytes(make())
         assert through(tmp_path / name, tmp_path / "out.btf.zarr", True), name
     for name, make in PICTURES.items():
-        assert pictures.decode(make(), name, pictures.header(make(), name)[1:3])[0].size
+        assert decoding.decode(make(), name, decoding.header(make(), name)[1:3])[0].size
 
 
 @pytest.mark.filterwarnings("ignore")  # Pillow warns of what it then refuses or reads

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from btfref.compare.tolerances import tolerance
+from btfref.gates.tolerances import tolerance
 from btfref.numerics import powers
 
 #: 100 examples of 1000 parameter sets.
@@ -102,7 +102,7 @@ def many(request):
 
 
 def test_drjit(many, llvm):
-    from mitsuba_plugins.analytic import lobe_power
+    from mitsuba_plugins.lib.analytic import lobe_power
 
     t, light, n = many
     value = np.array(lobe_power(llvm.Vector3f(t.T), llvm.Vector3f(light.T), llvm.Float(n)))
@@ -112,7 +112,7 @@ def test_drjit(many, llvm):
 
 VERTEX = """// Provides lobe powers of vertex attributes.
 // Expects nothing.
-#include "lib/powers.glsl"
+#include "lib/numbers/powers.glsl"
 in vec3 t;
 in vec3 l;
 in float n;
@@ -127,11 +127,11 @@ void main() {
 
 def test_glsl(many, need, tmp_path):
     need("gl")
-    from btfref.render import composer, gl
+    from btfref.rendering.gl import composer, device
 
     (tmp_path / "powers.vert").write_text(VERTEX)
     source = composer.compose("powers.vert", directories=[tmp_path])
-    ctx = gl.context()
+    ctx = device.context()
     target = ctx.simple_framebuffer((1, 1))
     target.use()
     program = ctx.program(vertex_shader=source, varyings=("value",))

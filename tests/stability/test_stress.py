@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from btfref import conventions
 from btfref.cli import main
-from btfref.compare.tolerances import tolerance
-from btfref.numerics.directions import directions
-from btfref.numerics.precision import computing_in
+from btfref.gates.tolerances import tolerance
+from btfref.numerics.sphere.directions import directions
+from btfref.precision import computing_in
 from btfref.registry import method, methods
 from btfref.stress import properties, runner
 from btfref.stress.data import DATA, make, scattered

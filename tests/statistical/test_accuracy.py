@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from plain_renders import PlainRenders
 
-from btfref.compare.significance import difference_test, welch_test
-from btfref.compare.tolerances import tolerance
+from btfref.comparison.significance import difference_test, welch_test
+from btfref.gates.tolerances import tolerance
 from btfref.mesostructure import build
-from btfref.numerics.directions import directions
+from btfref.numerics.sphere.directions import directions
 from btfref.sampling.synthesis import synthesize
 
 pytestmark = pytest.mark.usefixtures("llvm")

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from plain_renders import PlainRenders, texel_camera
 
-from btfref.compare.significance import bias_interval, difference_test, welch_test
-from btfref.compare.tolerances import tolerance
+from btfref.comparison.significance import bias_interval, difference_test, welch_test
+from btfref.gates.tolerances import tolerance
 from btfref.mesostructure import build
-from btfref.numerics.directions import directions
+from btfref.numerics.sphere.directions import directions
 from btfref.sampling.synthesis import synthesize
 
 TEXELS = 16
@@ -161,8 +161,8 @@ def test_direct_light_alone_is_caught(mesostructure, vectors, btf, plain):
 def test_raw_plugin_on_a_plane_equals_the_geometry(llvm, btf, plain, vectors, tmp_path):
     """The same camera on a flat rectangle with the raw BTF: the picture is the texels, and the geometry's."""
     import mitsuba_plugins
-    from btfref.representations import raw
-    from btfref.representations.container import save
+    from btfref.representations.file.container import save
+    from btfref.representations.tabulated import raw
 
     mi = llvm
     mitsuba_plugins.register()

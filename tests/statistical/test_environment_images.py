@@ -9,17 +9,17 @@ import gc
 import numpy as np
 import pytest
 
-from btfref.compare import compare
-from btfref.compare.significance import tile_equivalence, tile_half_widths
-from btfref.compare.tolerances import tolerance
+from btfref.comparison import compare
+from btfref.comparison.significance import tile_equivalence, tile_half_widths
+from btfref.gates.tolerances import tolerance
 from btfref.registry import methods
-from btfref.render.classes import pixel_classes
-from btfref.render.converged import converged
-from btfref.render.direct_light import regular
-from btfref.render.loading import loaded
-from btfref.render.realtime import realtime
-from btfref.render.reference import render
-from btfref.scenes import scene_file
+from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.offline.converged import converged
+from btfref.rendering.offline.direct_light import regular
+from btfref.rendering.offline.reference import render
+from btfref.scene.loading import loaded
+from btfref.scene.pixel_classes import pixel_classes
+from btfref.scene.shipped import scene_file
 
 SCENES = ("plane", "sphere", "cloth")
 ENVIRONMENTS = ("constant", "sky", "studio", "bright-texel")
@@ -109,7 +109,7 @@ def test_the_reference_without_shadows_is_unbiased(fits):
 
 def test_no_garbage_is_collected_while_kernels_are_traced(fits, monkeypatch):
     """A material in Python that a collection frees in the middle of Dr.Jit's list of materials is a crash."""
-    from btfref.render import reference
+    from btfref.rendering.offline import reference
 
     seen, once = [], reference._monte_carlo
     monkeypatch.setattr(

@@ -7,9 +7,10 @@ import pytest
 from PIL import Image
 
 from btfref.cli import main
-from btfref.compare import load_image, tolerance
 from btfref.formats import export_btf, import_btf
-from btfref.numerics.directions import directions
+from btfref.gates import tolerance
+from btfref.images import load_image
+from btfref.numerics.sphere.directions import directions
 from btfref.sampling import SampledBTF
 from btfref.sampling.synthesis import synthesize
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from btfref.compare.significance import bias_interval, difference_test, welch_test
-from btfref.compare.tolerances import tolerance
+from btfref.comparison.significance import bias_interval, difference_test, welch_test
 from btfref.errors import InputError
+from btfref.gates.tolerances import tolerance
 from btfref.mesostructure import build
-from btfref.numerics.directions import directions
-from btfref.render.geometry import BACKGROUND, INTERIOR, geometry_classes, render_geometry
+from btfref.numerics.sphere.directions import directions
+from btfref.rendering.offline.geometry import BACKGROUND, INTERIOR, geometry_classes, render_geometry
 from btfref.sampling.synthesis import synthesize
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -48,8 +48,8 @@ def _scene(mi, btf, *, tiles=1.0, origin=(0.4, -0.9, 1.6), **material):
 def files(need, tmp_path_factory):
     """Raw BTFs of a flat tile and of a checker."""
     need("llvm")
-    from btfref.representations import raw
-    from btfref.representations.container import save
+    from btfref.representations.file.container import save
+    from btfref.representations.tabulated import raw
 
     folder = tmp_path_factory.mktemp("btf")
     vectors = directions("ubo81").vectors[:19]
@@ -153,8 +153,8 @@ def test_scenes_that_have_no_geometry_truth_are_refused(llvm, files, change, mat
 
 
 def test_a_btf_without_a_parent_is_refused(llvm, files, tmp_path, rng):
-    from btfref.representations import raw
-    from btfref.representations.container import save
+    from btfref.representations.file.container import save
+    from btfref.representations.tabulated import raw
     from btfref.sampling import SampledBTF
 
     vectors = directions("2x4")

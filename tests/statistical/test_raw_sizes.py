@@ -3,7 +3,7 @@
 import pytest
 
 from btfref.sampling import SampledBTF
-from btfref.sampling.part import Part
+from btfref.sampling.store.part import Part
 from btfref.sampling.synthesis import synthesize_store
 
 pytestmark = pytest.mark.usefixtures("llvm")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from oracle import oracle_btf
 
-from btfref.compare.tolerances import tolerance
+from btfref.gates.tolerances import tolerance
 from btfref.registry import methods
 from btfref.representations import save
 from btfref.validate.sampling import chi_square, surface
@@ -64,7 +64,7 @@ def grid(n_theta=192, n_phi=384):
 
     Densities of lobes do not vanish at the horizon, so that no rule in sin² θ will do.
     """
-    from mitsuba_plugins.guide import N_RADIAL
+    from mitsuba_plugins.lib.guide import N_RADIAL
 
     border = np.sqrt(1 - np.arange(N_RADIAL + 1) / N_RADIAL)
     nodes, weights = np.polynomial.legendre.leggauss(n_theta // N_RADIAL)

@@ -11,7 +11,7 @@ import pytest
 from btfref.cli import main
 from btfref.errors import InputError, MissingDependencyError
 from btfref.sampling import memory, open_store
-from btfref.sampling.layout import shard_shape
+from btfref.sampling.store.layout import shard_shape
 from btfref.sampling.synthesis import synthesize_store
 
 pytestmark = pytest.mark.usefixtures("llvm")

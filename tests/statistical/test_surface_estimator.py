@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from plain_renders import PlainRenders
 
-from btfref.compare.significance import welch_test
-from btfref.compare.tolerances import tolerance
+from btfref.comparison.significance import welch_test
 from btfref.errors import InputError
+from btfref.gates.tolerances import tolerance
 from btfref.mesostructure import build
-from btfref.numerics.directions import directions
+from btfref.numerics.sphere.directions import directions
 from btfref.sampling import SampledBTF, open_store
-from btfref.sampling.part import Part
+from btfref.sampling.store.part import Part
 from btfref.sampling.synthesis import synthesize, synthesize_store
 
 pytestmark = pytest.mark.usefixtures("llvm")

@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from btfref.compare.significance import bias_interval, difference_test, welch_test
-from btfref.compare.tolerances import tolerance
+from btfref.comparison.significance import bias_interval, difference_test, welch_test
 from btfref.errors import InputError
+from btfref.gates.tolerances import tolerance
 from btfref.mesostructure import Mesostructure, Part, build
-from btfref.numerics.directions import directions
-from btfref.numerics.quadrature import gauss_hemisphere
-from btfref.sampling import SampledBTF, open_store, path_estimator, tiled_scene
+from btfref.numerics.sphere.directions import directions
+from btfref.numerics.sphere.quadrature import gauss_hemisphere
+from btfref.sampling import SampledBTF, open_store, tiled_scene
+from btfref.sampling.paths import estimator
 from btfref.sampling.synthesis import synthesize, synthesize_store
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -209,7 +210,7 @@ def test_same_seed_same_bytes_whatever_the_batches(monkeypatch):
     whole = synthesize("checker", seed=9, **SMALL)
     again = synthesize("checker", seed=9, **SMALL)
     # Five texels at a time, which do not divide sixteen.
-    monkeypatch.setattr(path_estimator, "SAMPLE_BUFFER", 5 * 4 * 12 * 8)
+    monkeypatch.setattr(estimator, "SAMPLE_BUFFER", 5 * 4 * 12 * 8)
     batches = synthesize("checker", seed=9, **SMALL)
     other = synthesize("checker", seed=10, **SMALL)
     for btf in (again, batches):

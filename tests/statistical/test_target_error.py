@@ -3,13 +3,15 @@
 import numpy as np
 import pytest
 
-from btfref.compare.significance import welch_test
-from btfref.compare.tolerances import tolerance
+from btfref.comparison.significance import welch_test
 from btfref.errors import InputError
+from btfref.gates.tolerances import tolerance
 from btfref.mesostructure import Mesostructure, Part, build
-from btfref.sampling import SampledBTF, adaptive, layout, open_store
-from btfref.sampling.adaptive import make_plan
-from btfref.sampling.part import Part as Selection
+from btfref.sampling import SampledBTF, open_store
+from btfref.sampling.paths import adaptive
+from btfref.sampling.paths.adaptive import make_plan
+from btfref.sampling.store import layout
+from btfref.sampling.store.part import Part as Selection
 from btfref.sampling.synthesis import synthesize, synthesize_store
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -96,7 +98,7 @@ def test_same_bytes_in_one_go_in_parts_and_in_small_blocks(tmp_path, tile, estim
     assert store.coverage.any(axis=(1, 2, 3)).sum() == 2
     with pytest.raises(InputError, match="all lights"):
         synthesize_store(parts, tile, only=Selection(lights=(1,)), **settings)
-    monkeypatch.setattr("btfref.sampling.path_estimator.SAMPLE_BUFFER", 300_000)
+    monkeypatch.setattr("btfref.sampling.paths.estimator.SAMPLE_BUFFER", 300_000)
     seen = []
     synthesize_store(parts, tile, progress=lambda *call: seen.append(call), **settings)
     assert seen == [(k, 8, "synthesis") for k in range(3, 9)]  # the pilot was kept

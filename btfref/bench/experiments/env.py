@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from btfref.bench.timing import machine
-from btfref.scenes import scene_file
+from btfref.scene.shipped import scene_file
 
 #: Pictures are small: the noise of their references averages out over the sphere.
 SIZE, GRID = (32, 32), 2
@@ -80,14 +80,14 @@ def _scene(path, scene, environment):
 
 
 def _inside(file, settings):
-    from btfref.render.classes import pixel_classes
+    from btfref.scene.pixel_classes import pixel_classes
 
     return pixel_classes(file, **settings) == 1
 
 
 def _error(image, reference, inside):
     """Noise-corrected relative RMSE with its 99 % interval."""
-    from btfref.compare import significance
+    from btfref.comparison import significance
 
     difference = image.image[inside].astype(float) - reference.image[inside]
     mse = significance.mse_interval(difference, reference.variance[inside].astype(float), confidence=0.99)
@@ -98,8 +98,8 @@ def _error(image, reference, inside):
 def _prefiltered(fitted, quick):
     """Every method with prefiltered maps, on a sphere."""
     from btfref.registry import methods
-    from btfref.render.converged import converged
-    from btfref.render.realtime import realtime
+    from btfref.rendering.gl.renderer import realtime
+    from btfref.rendering.offline.converged import converged
 
     rows, raw = [], []
     for key in [k for k, row in methods().items() if row.image_light]:
@@ -118,8 +118,8 @@ def _prefiltered(fitted, quick):
 
 def _order(fitted, quick):
     """Spherical harmonics of each order on a sphere, with and without a window, and lights for comparison."""
-    from btfref.render.converged import converged
-    from btfref.render.realtime import realtime
+    from btfref.rendering.gl.renderer import realtime
+    from btfref.rendering.offline.converged import converged
 
     rows, raw = [], []
     for environment in ENVIRONMENTS[: 2 if quick else None]:
@@ -142,8 +142,8 @@ def _order(fitted, quick):
 
 def _transfer(fitted, quick):
     """Compression of the transfer in a bowl: relative RMSE to spherical harmonics per pixel."""
-    from btfref.render.realtime import realtime
-    from btfref.render.transfer import TransferSettings
+    from btfref.rendering.environment_light.transfer import TransferSettings
+    from btfref.rendering.gl.renderer import realtime
 
     file, settings = _scene(fitted("lpca"), "bowl", "studio")
     inside, rows, raw = _inside(file, settings), [], []
@@ -162,11 +162,11 @@ def _transfer(fitted, quick):
 
 def _time(fitted, quick):
     """Milliseconds of the products at the paper's setting, and of frames."""
-    from btfref.render import transfer_light
-    from btfref.render.lighting import lighting_of
-    from btfref.render.realtime import Renderer
-    from btfref.render.scene import read_scene
-    from btfref.render.transfer import TransferSettings
+    from btfref.rendering.environment_light import transfer_light
+    from btfref.rendering.environment_light.lighting import lighting_of
+    from btfref.rendering.environment_light.transfer import TransferSettings
+    from btfref.rendering.gl.renderer import Renderer
+    from btfref.scene.description import read_scene
 
     rows, raw = [], {}
     file, settings = _scene(fitted("lpca"), "bowl", "studio")

@@ -61,7 +61,7 @@ def run(*, quick=False, progress=None, btf=None, only=None):
         clustered" or "storage, unclustered" → rmse, nrmse, relmse, delta_e00; ``range``: material → variant → factor →
         median over texels of peak over median of the map, the largest of the channels.
     """
-    from btfref.representations.factored_storage import cluster
+    from btfref.representations.factored.storage import cluster
     from btfref.sampling.synthesis import synthesize
 
     variants = {name: v for name, v in VARIANTS.items() if not only or v[0] in only}
@@ -122,7 +122,7 @@ def judged(btf, variants, factors, report):
     btf : SampledBTF
     variants : dict
         As ``VARIANTS``.
-    factors : dict of str to btfref.representations.factored_fit.Factors
+    factors : dict of str to btfref.representations.factored.fit.Factors
         Those of ``btf`` that are there already.
     report : callable
 
@@ -130,7 +130,7 @@ def judged(btf, variants, factors, report):
     -------
     errors, ranges : dict
     """
-    from btfref.representations.factored_storage import Storing, cluster, store
+    from btfref.representations.factored.storage import Storing, cluster, store
 
     errors, ranges = {}, {}
     for i, (name, (key, parameters, how)) in enumerate(variants.items()):
@@ -161,7 +161,7 @@ def table_errors(fitted, btf):
 
     Parameters
     ----------
-    fitted : btfref.representations.factored.Representation
+    fitted : btfref.representations.factored.definition.Representation
     btf : SampledBTF
 
     Returns
@@ -171,9 +171,10 @@ def table_errors(fitted, btf):
         ε = (``RELMSE_SHARE`` · mean)²; ``delta_e00``, the mean over ``N_PICTURES`` pictures of one view and light
         each, under one exposure.
     """
-    from btfref.compare.colour import delta_e00, fit_display
-    from btfref.numerics.factoring import map_operators
-    from btfref.representations.factored import texel_parts
+    from btfref.comparison.colour import delta_e00
+    from btfref.images.display import fit_display
+    from btfref.numerics.solvers.factoring import map_operators
+    from btfref.representations.factored.definition import texel_parts
 
     operators = map_operators(
         btf.views.vectors, btf.lights.vectors, fitted.maps["factor_p"].shape[1], "factor_d" in fitted.maps

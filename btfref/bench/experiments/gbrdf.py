@@ -65,10 +65,10 @@ def run(*, quick=False, progress=None, btf=None, only=None, report=None):
 
 def case(btf, progress=None, cells=None):
     """Figures of one BTF; see :func:`run`. A list ``cells`` takes the parts of a report."""
-    from btfref.decomposition import pipeline
     from btfref.registry import method
-    from btfref.representations.container import payload_bytes
-    from btfref.representations.gbrdf_geometry import from_mesostructure
+    from btfref.representations.file.container import payload_bytes
+    from btfref.representations.gbrdf.decomposition import pipeline
+    from btfref.representations.gbrdf.geometry import from_mesostructure
 
     start = time.perf_counter()
     stages = {}
@@ -121,7 +121,8 @@ def material_figures(made, truth):
 
 def picture_error(representation, btf):
     """RMS ΔE00 over pictures of one view and one light each, under one exposure."""
-    from btfref.compare.colour import delta_e00, fit_display
+    from btfref.comparison.colour import delta_e00
+    from btfref.images.display import fit_display
 
     rows, columns = btf.texels
     rng = np.random.default_rng(0)
@@ -139,9 +140,13 @@ def picture_error(representation, btf):
 
 def height_fields(btf, stages):
     """Heights in tiles and slopes by name: ours and the paper's two baselines."""
-    from btfref.decomposition.heights import correlation_heights, helmholtz_stereopsis, similarity
-    from btfref.decomposition.pairs import ReciprocalPairs
     from btfref.numerics.heightfield import HeightField
+    from btfref.representations.gbrdf.decomposition.heights import (
+        correlation_heights,
+        helmholtz_stereopsis,
+        similarity,
+    )
+    from btfref.representations.gbrdf.decomposition.pairs import ReciprocalPairs
 
     pairs, layers = ReciprocalPairs(btf), stages["layers"]
     correlation = correlation_heights(similarity(pairs, layers), layers)
@@ -170,9 +175,9 @@ def height_errors(fields, truth):
 
 def map_cells(name, fields, made, truth):
     """Parts of a report: heights, normals, materials and colours beside the truth."""
-    from btfref.compare import compare
+    from btfref.comparison import compare
     from btfref.report import Cell
-    from btfref.representations.gbrdf_maps import PALETTE
+    from btfref.representations.gbrdf.maps import PALETTE
 
     low, high = truth.field.bottom, truth.field.top
     depth = max(high - low, 1e-6)

@@ -1,6 +1,7 @@
 """The four edits of the g-BRDF paper (section 6, Table 2), each on its maps and each rendered: ``gbrdf-edits.png``.
 
-Run in a checkout: ``python btfref/docs/gbrdf_edits.py FOLDER``. The maps before and after every edit stay in FOLDER.
+Run in a checkout: ``python btfref/bench/experiments/gbrdf_edits.py FOLDER``. The maps before and after every edit
+stay in FOLDER.
 """
 
 import sys
@@ -9,15 +10,15 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from btfref.compare import save_image
+from btfref.images import save_image
 from btfref.numerics.microfacets import isotropic_ndf
-from btfref.numerics.parabolic import texel_directions
-from btfref.render.realtime import realtime
+from btfref.numerics.sphere.parabolic import texel_directions
+from btfref.rendering.gl.renderer import realtime
 from btfref.representations import save
-from btfref.representations.gbrdf_build import from_maps, from_photograph
-from btfref.representations.gbrdf_geometry import from_mesostructure
-from btfref.representations.gbrdf_maps import export_maps, hue_of_turns, import_maps, turns_of_hue
-from btfref.scenes import scene_file
+from btfref.representations.gbrdf.build import from_maps, from_photograph
+from btfref.representations.gbrdf.geometry import from_mesostructure
+from btfref.representations.gbrdf.maps import export_maps, hue_of_turns, import_maps, turns_of_hue
+from btfref.scene.shipped import scene_file
 
 SIZE = (192, 192)
 
@@ -127,7 +128,7 @@ def main(folder):
             ]
         )
     with Image.open(folder / "4-photograph.png") as photo:
-        from btfref.compare.colour import decode_srgb
+        from btfref.numerics.colour import decode_srgb
 
         rows[0][3] = decode_srgb(np.asarray(photo.resize(SIZE)) / 255.0)
     save_image(folder / "gbrdf-edits.png", np.concatenate([np.concatenate(row, 1) for row in rows]))

@@ -12,7 +12,7 @@ import time
 import numpy as np
 
 from btfref.bench.timing import interleaved, machine
-from btfref.numerics.threads import one_blas_thread
+from btfref.numerics.solvers.threads import one_blas_thread
 
 LOBES = 2
 
@@ -47,7 +47,7 @@ def run(*, quick=False, progress=None, btf=None, only=None):
         absolute residual over the same random fits, times π; ``parameters``; ``machine``.
     """
     from btfref.bench.data import checker
-    from btfref.representations import rf_lobes
+    from btfref.representations.analytic import rf_lobes
 
     btf = btf or checker(spp=8, progress=progress)
     lights = btf.lights.vectors
@@ -110,8 +110,8 @@ def run(*, quick=False, progress=None, btf=None, only=None):
 
 def residual_fields(btf):
     """Luminance without its diffuse term, shape (n_views · n_texels, n_lights)."""
-    from btfref.representations import rf_lobes
-    from btfref.representations.analytic import luminance_blocks
+    from btfref.representations.analytic import rf_lobes
+    from btfref.representations.analytic.light_functions import luminance_blocks
 
     lights, data = btf.lights.vectors, []
     for _, luminance, _ in luminance_blocks(btf):

@@ -86,9 +86,9 @@ def run(*, quick=False, progress=None, btf=None, only=None, report=None):
 
 def _moving(scene, path, frames, grid, tell):
     """Error and flicker of a scene, and the pictures of its first frame."""
-    from btfref.render.realtime import realtime
-    from btfref.render.reference import render
-    from btfref.scenes import scene_file
+    from btfref.rendering.gl.renderer import realtime
+    from btfref.rendering.offline.reference import render
+    from btfref.scene.shipped import scene_file
 
     file, (moved, step) = scene_file(scene), MOVES[scene]
     kinds = ("none", "auto")
@@ -128,7 +128,8 @@ def _rms(values):
 
 def _cell(scene, pictures, found):
     """The scene's part of the report."""
-    from btfref.compare import Measured, compare, judge
+    from btfref.comparison import compare
+    from btfref.gates import Measured, judge
     from btfref.report import Cell
 
     comparison = compare(pictures["1 sample, with levels"], pictures["reference"], flip=False)
@@ -147,10 +148,11 @@ def _cost(path, rounds, tell):
     """Fetches and times of a plane that fills the picture, near and far."""
     import drjit as dr
 
-    from btfref.render import camera, loading, reference
-    from btfref.render.realtime import Renderer, realtime
-    from btfref.render.scene import read_scene
-    from btfref.scenes import scene_file
+    from btfref.rendering.gl.renderer import Renderer, realtime
+    from btfref.rendering.offline import reference
+    from btfref.scene import camera, loading
+    from btfref.scene.description import read_scene
+    from btfref.scene.shipped import scene_file
 
     file = scene_file("plane")
     parameters = {k: {"btf": path, "tiling": str(n)} for k, n in (("near", NEAR), ("far", FAR))}

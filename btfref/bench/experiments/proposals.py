@@ -108,8 +108,8 @@ def _efficiency(pictures, times):
 
 def _scenes(mi):
     """Scenes without material, by light and estimator."""
-    from btfref.render.environment import sunsky
-    from btfref.scenes import scene_file
+    from btfref.scene.environment import sunsky
+    from btfref.scene.shipped import scene_file
 
     t = mi.ScalarTransform4f
     upright = t().rotate([1, 0, 0], 90)

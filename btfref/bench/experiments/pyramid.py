@@ -40,7 +40,7 @@ def run(*, quick=False, progress=None, btf=None, only=None):
         (average, minimum, maximum), ``components`` with the average of both for Y by number of components, ``bytes``;
         ``raw``: seconds.
     """
-    from btfref.representations import laplacian
+    from btfref.representations.laplacian import definition as laplacian
 
     names = only or (MESOSTRUCTURES[:1] if quick else MESOSTRUCTURES)
     summary, raw = {}, {}
@@ -72,7 +72,7 @@ def run(*, quick=False, progress=None, btf=None, only=None):
 
 def _channels(btf):
     """π B in Y, Cb, Cr, each (texels, pairs) float32."""
-    from btfref.numerics.lowrank import texel_matrix
+    from btfref.numerics.solvers.lowrank import texel_matrix
     from btfref.numerics.ycbcr import FROM_RGB
 
     matrix = texel_matrix(btf.values).reshape(-1, btf.values.shape[0] * btf.values.shape[1], 3)
@@ -102,7 +102,7 @@ def _truncated(representation, n):
 
 
 def _map_bytes(representation):
-    from btfref.representations.container import payload_bytes
+    from btfref.representations.file.container import payload_bytes
 
     maps = {name: (array.shape, array.dtype.name) for name, array in representation.maps.items()}
     return payload_bytes(maps, representation.meta)

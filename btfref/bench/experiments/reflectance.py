@@ -64,8 +64,8 @@ def run(*, quick=False, progress=None, btf=None, only=None):
 def fitted(btf, key):
     """ε of one method with its maps in floats, in halves and in 8 bits."""
     from btfref.registry import method
-    from btfref.representations.analytic import fit_report
-    from btfref.representations.container import payload_bytes
+    from btfref.representations.analytic.light_functions import fit_report
+    from btfref.representations.file.container import payload_bytes
 
     row = method(key)
     start = time.perf_counter()

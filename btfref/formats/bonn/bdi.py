@@ -7,7 +7,7 @@ import mmap
 
 import numpy as np
 
-from btfref.formats.bonn_header import read_rotations
+from btfref.formats.bonn.header import read_rotations
 
 FULL, BZIP, SPARSE = 0, 1, 2
 _NAMES = {FULL: "full", BZIP: "full, bzip2", SPARSE: "sparse"}

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.formats import bonn_bdi, bonn_colour
+from btfref.formats.bonn import bdi, colour
 from btfref.formats.parts import open_parts
 from btfref.formats.source import MEMORY
-from btfref.numerics.threads import one_blas_thread
-from btfref.versions import __version__
+from btfref.numerics.solvers.threads import one_blas_thread
+from btfref.provenance import __version__
 
 #: Scan lines per chunk that the owners' writer uses.
 SCAN_LINES = 4
@@ -103,7 +103,7 @@ def _header(source, signature):
 def _write_bdi(stream, source, memory, progress):
     rows, columns = source.texels
     stream.write(_header(source, b"!BDIF06R2!"))
-    stream.write(struct.pack("<IIIB", columns, rows, SCAN_LINES, bonn_bdi.FULL))
+    stream.write(struct.pack("<IIIB", columns, rows, SCAN_LINES, bdi.FULL))
     stream.write(np.ones(rows * columns, np.uint8).tobytes())
     stream.write(struct.pack("<I", 0))
     line = len(source.views) * len(source.lights) * columns * 3 * 2
@@ -225,7 +225,7 @@ def _matrices(source, view, model):
     values = source.view(view)[:, ::-1].astype(np.float32)
     if model == 11:
         try:
-            values = bonn_colour.log_yuv(values)
+            values = colour.log_yuv(values)
         except ValueError as found:
             raise InputError(str(found), field="colour_model", got=11, expected="0 for such values") from None
     return [np.ascontiguousarray(values[..., c]).reshape(len(values), -1) for c in range(3)]

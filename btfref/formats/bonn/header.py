@@ -177,7 +177,7 @@ def to_rgb(channels, file):
     InputError
         Channels that are neither colours nor wavelengths.
     """
-    from btfref.formats.spectral import wavelengths
+    from btfref.formats.image_sets.spectral import wavelengths
     from btfref.numerics.colour import spectral_weights
 
     if channels == ("R", "G", "B"):

@@ -10,8 +10,8 @@ import hashlib
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.formats import bonn_colour
-from btfref.formats.bonn_header import read_header, signature_of, to_rgb
+from btfref.formats.bonn import colour
+from btfref.formats.bonn.header import read_header, signature_of, to_rgb
 from btfref.formats.reading import Reader
 from btfref.formats.source import LARGEST_COUNT, Format, Source
 
@@ -43,7 +43,7 @@ def open_bonn(path):
     reader = Reader(path)
     header = read_header(reader)
     if header.family == "BDI":
-        from btfref.formats.bonn_bdi import BDI
+        from btfref.formats.bonn.bdi import BDI
 
         values = BDI(reader, header)
     else:
@@ -140,8 +140,8 @@ class _DFMF:
         at = reader.offset
         self.model = reader.number("i32", "colour model")
         n = len(header.channels)
-        if self.model not in bonn_colour.NAMES or (n != 3 and self.model not in bonn_colour.ANY_CHANNELS):
-            known = ", ".join(map(str, bonn_colour.NAMES if n == 3 else bonn_colour.ANY_CHANNELS))
+        if self.model not in colour.NAMES or (n != 3 and self.model not in colour.ANY_CHANNELS):
+            known = ", ".join(map(str, colour.NAMES if n == 3 else colour.ANY_CHANNELS))
             reader.fail(
                 "colour model", "colour model", at=at, got=f"{self.model} of {n} channels", expected=known
             )
@@ -149,7 +149,7 @@ class _DFMF:
         self._matrix = reader.floats("colour matrix", (3, 3))
         self._factors = [_Factors(reader, f"channel {c}", header.n_pairs, header.n_texels) for c in range(n)]
         self.facts = {
-            "colour_model": f"{self.model} ({bonn_colour.NAMES[self.model]})",
+            "colour_model": f"{self.model} ({colour.NAMES[self.model]})",
             "components": [one.rank for one in self._factors],
             "scalar_bytes": [one.scalar for one in self._factors],
         }
@@ -160,7 +160,7 @@ class _DFMF:
             one.of_pairs[start + first : start + last].astype(np.float32) @ one.texels.T
             for one in self._factors
         ]
-        return bonn_colour.undo(np.stack(planes, -1), self.model, self._mean, self._matrix)
+        return colour.undo(np.stack(planes, -1), self.model, self._mean, self._matrix)
 
 
 class _FMF:
@@ -205,7 +205,7 @@ class _FMF:
         else:
             rows = self._factors.of_pairs[first * n : last * n].astype(np.float32)
             values = (rows @ self._factors.texels.T).reshape(last - first, n, -1).transpose(0, 2, 1)
-        return np.exp(values) - np.float32(bonn_colour.EPSILON) if self._log else values
+        return np.exp(values) - np.float32(colour.EPSILON) if self._log else values
 
 
 class _PVF:
@@ -265,8 +265,8 @@ class _PVF:
 
 
 def export(btf, path, **settings):
-    """Write DFMF or BDI: `btfref.formats.bonn_export`."""
-    from btfref.formats.bonn_export import export_bonn
+    """Write DFMF or BDI: `btfref.formats.bonn.export`."""
+    from btfref.formats.bonn.export import export_bonn
 
     return export_bonn(btf, path, **settings)
 

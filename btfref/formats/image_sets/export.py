@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.formats import pictures, radiance
-from btfref.formats.images import NOTE
+from btfref.formats.image_sets.reader import NOTE
 from btfref.formats.parts import open_parts
+from btfref.images import decoding, radiance
 
 #: How names are written: pattern of folder and file, and whether it starts with a number.
 _NAMES = {
@@ -39,7 +39,7 @@ def export_images(
     moved=0,
     progress=None,
 ):
-    """Write a folder (or, when the path ends in ``.zip``, an archive) of pictures.
+    """Write a folder (or, when the path ends in ``.zip``, an archive) of decoding.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def _whole_degrees(directions, name):
 
 def _moved_light(source, values, light, degrees):
     """Where the light goes, and the picture under it: interpolated between its neighbours."""
-    from btfref.numerics.directions import spherical
+    from btfref.numerics.sphere.directions import spherical
 
     theta = light[0] + degrees if light[0] + degrees <= 75 else light[0] - degrees
     theta, phi = (theta, light[1]) if theta >= 0 else (-theta, (light[1] + 180) % 360)
@@ -155,7 +155,7 @@ def _bytes(values, image, encode, planes, quality, counts):
     if any(np.abs(plane).max() > 65504 for plane in channels.values()):
         raise InputError("values beyond half floats", field="scale", expected="a larger scale")
     with tempfile.NamedTemporaryFile(suffix=".exr") as stream:
-        pictures.write_exr(channels, stream.name)
+        decoding.write_exr(channels, stream.name)
         return Path(stream.name).read_bytes()
 
 

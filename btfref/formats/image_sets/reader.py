@@ -7,10 +7,10 @@ import json
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.formats import pictures
-from btfref.formats.angles import grid, style_of
-from btfref.formats.files import files_of
+from btfref.formats.image_sets.angles import grid, style_of
+from btfref.formats.image_sets.files import files_of
 from btfref.formats.source import Source
+from btfref.images import decoding
 
 #: Our own note beside exported images: what 8 bits and names cannot say. Other readers pass it over.
 NOTE = "btfref.json"
@@ -36,7 +36,7 @@ def image_source(path, name, to_linear, *, cosine_included, scale, allow_missing
         Of the format.
     to_linear : callable
         ``to_linear(pixels, channels, where)``: linear Rec. 709, float32 (rows, columns, 3), of what
-        `btfref.formats.pictures.decode` gives.
+        `btfref.images.decoding.decode` gives.
     cosine_included, scale
         As of `Source`, where no note of ours says otherwise.
     allow_missing : bool
@@ -49,7 +49,7 @@ def image_source(path, name, to_linear, *, cosine_included, scale, allow_missing
     files = files_of(path)
     found = grid(files.images(), path, allow_missing=allow_missing)
     first = next(iter(found.images.values()))
-    kind, rows, columns, channels = pictures.header(files.read(first), files.where(first))
+    kind, rows, columns, channels = decoding.header(files.read(first), files.where(first))
     note = _note(files)
     texels = rows, columns
 
@@ -59,7 +59,7 @@ def image_source(path, name, to_linear, *, cosine_included, scale, allow_missing
             image = found.images.get((view, light))
             if image is not None:
                 where = files.where(image)
-                result[slot] = to_linear(*pictures.decode(files.read(image), where, texels), where)
+                result[slot] = to_linear(*decoding.decode(files.read(image), where, texels), where)
         return result
 
     return Source(

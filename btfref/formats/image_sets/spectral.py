@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.formats.images import image_source, pick, recogniser
+from btfref.formats.image_sets.reader import image_source, pick, recogniser
 from btfref.formats.source import Format
 from btfref.numerics.colour import spectral_weights
 

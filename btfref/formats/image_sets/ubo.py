@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.formats.images import image_source, pick, recogniser
+from btfref.formats.image_sets.reader import image_source, pick, recogniser
 from btfref.formats.source import Format
 
 GAMMA = 2.2
@@ -52,8 +52,8 @@ def open_ubo(path, *, allow_missing=False, gamma=GAMMA):
 
 
 def export(btf, path, **settings):
-    """Write pictures: `btfref.formats.image_export.export_images` with names of UBO2003."""
-    from btfref.formats.image_export import export_images
+    """Write pictures: `btfref.formats.image_sets.export.export_images` with names of UBO2003."""
+    from btfref.formats.image_sets.export import export_images
 
     settings = {"image": "jpg", "gamma": GAMMA, **settings}
     if settings["image"] not in ("jpg", "png", "hdr", "exr"):

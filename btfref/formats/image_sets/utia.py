@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.formats.images import image_source, pick, recogniser
+from btfref.formats.image_sets.reader import image_source, pick, recogniser
 from btfref.formats.source import Format
 from btfref.numerics.colour import RGB_TO_XYZ, decode_srgb, encode_srgb, rgb_from_xyz
 
@@ -59,8 +59,8 @@ def open_utia(path, *, allow_missing=False):
 
 
 def export(btf, path, **settings):
-    """Write pictures: `btfref.formats.image_export.export_images` with names of UTIA."""
-    from btfref.formats.image_export import export_images
+    """Write pictures: `btfref.formats.image_sets.export.export_images` with names of UTIA."""
+    from btfref.formats.image_sets.export import export_images
 
     settings = {"image": "exr", **settings}
     if settings["image"] not in ("png", "exr"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.numerics.threads import one_blas_thread
+from btfref.numerics.solvers.threads import one_blas_thread
 
 #: The iteration stops when the total error falls by less than this share.
 RELATIVE_PROGRESS = 1e-4

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from btfref.numerics.halfway import half_difference
-from btfref.numerics.parabolic import bilinear_stencil
+from btfref.numerics.sphere.halfway import half_difference
+from btfref.numerics.sphere.parabolic import bilinear_stencil
 
 #: Below this, a quotient's denominator counts as this: tables are scaled to a mean of 1, so nothing of use is so small,
 #: and squares of it are still normal floats.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics.threads import one_blas_thread
+from btfref.numerics.solvers.threads import one_blas_thread
 
 
 def texel_matrix(values):

@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics import interpolation
-from btfref.numerics.quadrature import hemisphere_weights
+from btfref.numerics.sphere import interpolation
+from btfref.numerics.sphere.quadrature import hemisphere_weights
 
 #: Rings of the named sets: polar angle (degrees), number of samples, azimuth of the first sample (degrees).
 #: "ubo81": UBO2003, ATRIUM and UTIA; "ubo151": UBO2014, Dome 1.
@@ -71,7 +71,7 @@ class DirectionSet:
 
     @cached_property
     def rings(self):
-        """Rings as (n_rings, 4) (see :class:`~btfref.numerics.interpolation.RingInterpolation`), or None."""
+        """Rings as (n_rings, 4) (see :class:`~btfref.numerics.sphere.interpolation.RingInterpolation`), or None."""
         return _find_rings(self.theta, self.phi)
 
     @cached_property

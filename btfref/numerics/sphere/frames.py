@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.numerics.precision import real
+from btfref.precision import real
 
 #: Length of interpolated cosine and sine below which tangents of all directions meet: there is no turn to speak of, and
 #: float32 would make one up (its rounding of 6e-8 turns a tangent by 6e-6 at this length).

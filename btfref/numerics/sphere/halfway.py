@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.numerics.precision import real
+from btfref.precision import real
 
 
 def half_frame(h):

@@ -90,8 +90,8 @@ def project(samples, w, weights, order):
     w : array_like, shape (n, 3)
         Unit vectors.
     weights : array_like, shape (n,)
-        Solid angles in sr; those of :attr:`btfref.numerics.directions.DirectionSet.quadrature_weights` integrate over
-        the upper hemisphere.
+        Solid angles in sr; those of :attr:`btfref.numerics.sphere.directions.DirectionSet.quadrature_weights`
+        integrate over the upper hemisphere.
     order : int
 
     Returns

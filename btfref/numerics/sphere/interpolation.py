@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics.parabolic import hemisphere_to_square
-from btfref.numerics.precision import real
+from btfref.numerics.sphere.parabolic import hemisphere_to_square
+from btfref.precision import real
 
 #: Columns of a row of ``triangles``: vertices a and b, dual normals of a, b and c, indices, neighbours, padding.
 TRIANGLE_FLOATS = 24
@@ -219,7 +219,7 @@ def _neighbours(simplices):
 
 
 def _start_cells(interpolation):
-    from btfref.numerics.parabolic import square_to_hemisphere
+    from btfref.numerics.sphere.parabolic import square_to_hemisphere
 
     centre = (np.arange(START_CELLS) + 0.5) / START_CELLS * 2 - 1
     s, t = np.meshgrid(centre, centre)

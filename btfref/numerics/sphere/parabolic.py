@@ -3,15 +3,15 @@
 A table of n × n texels covers (s, t) in [−1, 1]²: ``table[row, column]`` with s along columns and t along rows, texel
 centres at ``(i + ½) · 2/n − 1``, as an OpenGL texture of s ↦ (s + 1)/2 has them. Lookups are bilinear and clamp to the
 edge. The hemisphere fills the unit disc; texels outside of it hold the value of the nearest point of the horizon, so
-that no lookup of the hemisphere reads anything else. The ports are :mod:`mitsuba_plugins.parabolic` and
-``shaders/lib/parabolic_maps.glsl``.
+that no lookup of the hemisphere reads anything else. The ports are :mod:`mitsuba_plugins.lib.parabolic` and
+``shaders/lib/lookup/parabolic_maps.glsl``.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from btfref.numerics.precision import real
+from btfref.precision import real
 
 
 def hemisphere_to_square(w):

@@ -12,9 +12,9 @@ import numpy as np
 
 from btfref import conventions
 from btfref.errors import InputError
-from btfref.numerics import harmonics, interpolation
-from btfref.numerics.quadrature import gauss_hemisphere
-from btfref.render import light_set
+from btfref.numerics.sphere import harmonics, interpolation
+from btfref.numerics.sphere.quadrature import gauss_hemisphere
+from btfref.rendering.environment_light import light_set
 
 #: Bands of the paper.
 ORDER = 5
@@ -59,10 +59,10 @@ def environment_coefficients(environment, order, *, window=None):
 
     Parameters
     ----------
-    environment : btfref.render.environment.Environment
+    environment : btfref.scene.environment.Environment
     order : int
     window : str, optional
-        See :func:`btfref.numerics.harmonics.window`.
+        See :func:`btfref.numerics.sphere.harmonics.window`.
 
     Returns
     -------
@@ -78,11 +78,11 @@ def environment_coefficients(environment, order, *, window=None):
 
 
 def estimated_error(environment, coefficients):
-    """How differently receivers see an environment and its harmonics: see :mod:`btfref.render.light_set`.
+    """How differently receivers see an environment and its harmonics: see `light_set`.
 
     Parameters
     ----------
-    environment : btfref.render.environment.Environment
+    environment : btfref.scene.environment.Environment
     coefficients : ndarray, shape (order², 3)
         World space.
 

@@ -3,8 +3,8 @@
 Source: Meseth, Müller, Klein 2004, section 5.2. Differs from it in the foreshortening: their lobes multiply (n · l),
 approximated by (n · t); ours hold it. What lies below the local horizon, which a lobe over the sphere sees and the BTF
 does not, is cut off: the rest is looked up as the lobe that has its integral and its centroid
-(:func:`btfref.render.prefilter.clipped_lobes`), and what is small and bright is no part of the maps
-(:mod:`btfref.render.split_light`).
+(:func:`btfref.rendering.environment_light.prefilter.clipped_lobes`), and what is small and bright is no part of the
+maps (:mod:`btfref.rendering.environment_light.split_light`).
 
 A class a method, found by the registry: ``SHADER`` provides ``btf_environment``, ``tables`` what it reads, and
 ``radiance`` the same in float64, from the same tables.
@@ -15,14 +15,14 @@ from __future__ import annotations
 import numpy as np
 
 from btfref import conventions
-from btfref.numerics import interpolation
 from btfref.numerics.powers import FLOOR, safe_power
-from btfref.render import prefilter
-from btfref.render.split_light import split_light, unsplit
-from btfref.representations.analytic import held
-from btfref.representations.lafortune import flat_maps
+from btfref.numerics.sphere import interpolation
+from btfref.rendering.environment_light import prefilter
+from btfref.rendering.environment_light.split_light import split_light, unsplit
+from btfref.representations.analytic.lafortune import flat_maps
+from btfref.representations.analytic.light_functions import held
+from btfref.representations.analytic.rf_lobes import parabolic_axis
 from btfref.representations.lookup import CHUNK
-from btfref.representations.rf_lobes import parabolic_axis
 
 
 class _PrefilteredLobes:
@@ -33,7 +33,7 @@ class _PrefilteredLobes:
 
     @classmethod
     def split(cls, representation, environment):
-        """What is filtered and what becomes lights: a :class:`btfref.render.split_light.SplitLight`."""
+        """What is filtered and what becomes lights: a `SplitLight`."""
         edge = representation.meta["constants"]["light_edge"]
         return split_light(environment, edge, cosine=cls.cosine)
 
@@ -44,7 +44,7 @@ class _PrefilteredLobes:
         Parameters
         ----------
         representation : Representation
-        environment : btfref.render.environment.Environment or btfref.render.split_light.Cells
+        environment : btfref.scene.environment.Environment or btfref.rendering.environment_light.split_light.Cells
         size : int
             Texels a side of a parabolic map.
         slices : int

@@ -58,7 +58,7 @@ class LightSet:
         return len(self.w)
 
     def table(self):
-        """For ``shaders/lib/environment_lights.glsl``: direction, then power; float32 (n ≥ 1, 2, 4)."""
+        """For ``shaders/lib/light/environment_lights.glsl``: direction, then power; float32 (n ≥ 1, 2, 4)."""
         table = np.zeros((max(len(self), 1), 2, 4), np.float32)
         table[: len(self), 0, :3], table[: len(self), 1, :3] = self.w, self.power
         return table
@@ -69,7 +69,7 @@ def light_set(environment, *, lights=None, target=TARGET):
 
     Parameters
     ----------
-    environment : btfref.render.environment.Environment
+    environment : btfref.scene.environment.Environment
     lights : int, optional
         Their number; fewer where fewer cells are lit. Default: the smallest power of two, 16 to 4096, whose estimated
         error is at most ``target``.
@@ -161,7 +161,7 @@ def estimated_error(w, power, cell_w, cell_power):
     w, power : ndarray, shape (n, 3)
         The lights.
     cell_w, cell_power : ndarray, shape (m, 3)
-        See :meth:`btfref.render.environment.Environment.cells`.
+        See :meth:`btfref.scene.environment.Environment.cells`.
 
     Returns
     -------

@@ -14,14 +14,19 @@ from functools import cached_property
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics import harmonics
+from btfref.numerics.sphere import harmonics
 from btfref.registry import image_light, methods
-from btfref.render import harmonic_light, transfer_light
-from btfref.render.environment import constant
-from btfref.render.light_set import light_set
-from btfref.render.paths import PATHS
-from btfref.render.shapes import neighbours
-from btfref.render.transfer import TransferSettings, clustered, corner_matrices, vertex_transfer
+from btfref.rendering.environment_light import harmonic_light, transfer_light
+from btfref.rendering.environment_light.light_set import light_set
+from btfref.rendering.environment_light.transfer import (
+    TransferSettings,
+    clustered,
+    corner_matrices,
+    vertex_transfer,
+)
+from btfref.rendering.environment_light.ways import PATHS
+from btfref.scene.environment import constant
+from btfref.scene.shapes import neighbours
 
 #: Lookups whose mean is the albedo of a material.
 ALBEDO_SAMPLES = 512
@@ -62,7 +67,7 @@ class Prepared:
         Uniforms of pictures that add up; one, without any, where a single picture does.
     bins : ndarray of int, shape (n + 1,), or None
         Where the triangles of each pass begin in the table ``bin_triangles``; None: all are drawn.
-    transfer : btfref.render.transfer_light.TransferLight or None
+    transfer : btfref.rendering.environment_light.transfer_light.TransferLight or None
         What can be lit anew.
     """
 
@@ -82,10 +87,10 @@ class Lighting:
 
     Parameters
     ----------
-    environment : btfref.render.environment.Environment
+    environment : btfref.scene.environment.Environment
     path : {"auto", "prefiltered", "lights", "sh", "transfer"}
     lights : int, optional
-        Of the path "lights"; see :func:`btfref.render.light_set.light_set`.
+        Of the path "lights"; see :func:`btfref.rendering.environment_light.light_set.light_set`.
     order : int
         Bands of spherical harmonics of the paths "sh" and "transfer".
     window : {"none", "hanning", "lanczos"}, optional
@@ -94,7 +99,7 @@ class Lighting:
         Of the scene, for the path "transfer".
     delta : bool
         Whether directional and point lights stand beside the environment: that path then draws them apart.
-    transfer : btfref.render.transfer.TransferSettings, optional
+    transfer : btfref.rendering.environment_light.transfer.TransferSettings, optional
         Of that path.
 
     Raises
@@ -312,12 +317,12 @@ class Lighting:
 
 
 def lit(representation, found, uv, w_view, to_world, evaluate=None):
-    """Radiance under directional lights in float64, as ``shaders/lib/environment_lights.glsl`` sums it.
+    """Radiance under directional lights in float64, as ``shaders/lib/light/environment_lights.glsl`` sums it.
 
     Parameters
     ----------
     representation : Representation
-    found : btfref.render.light_set.LightSet
+    found : btfref.rendering.environment_light.light_set.LightSet
     uv : array_like, shape (N, 2)
     w_view : array_like, shape (N, 3)
         Local frame.

@@ -15,8 +15,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from btfref.numerics.parabolic import bilinear_stencil, square_to_hemisphere, texel_centres
 from btfref.numerics.powers import FLOOR
+from btfref.numerics.sphere.parabolic import bilinear_stencil, square_to_hemisphere, texel_centres
 
 #: Sampled exponents of the paper: 2^(i/2), i = 0 … 10.
 SLICES = 11
@@ -51,7 +51,7 @@ def lobe_maps(environment, *, size=SIZE, slices=SLICES):
 
     Parameters
     ----------
-    environment : btfref.render.environment.Environment
+    environment : btfref.scene.environment.Environment
     size : int
         Texels a side.
     slices : int
@@ -90,11 +90,11 @@ def moment_maps(environment, edge, *, size=SIZE):
     """Moments of the light over the hemisphere about any normal, as a polynomial of the light needs them.
 
     Lights are held at the outermost measured cosine and fade below it, about that normal: see
-    :func:`btfref.representations.analytic.held`.
+    :func:`btfref.representations.analytic.light_functions.held`.
 
     Parameters
     ----------
-    environment : btfref.render.environment.Environment
+    environment : btfref.scene.environment.Environment
     edge : float
         Smallest measured cosine; 0 holds nothing.
     size : int
@@ -207,7 +207,7 @@ def clipped_lobes(edge, *, cosine, slices=CLIPPED, heights=HEIGHTS):
 
 
 def map_lookup(maps, index, w):
-    """Bilinear lookup in one of several maps over the sphere, as ``shaders/lib/sphere_maps.glsl`` does it.
+    """Bilinear lookup in one of several maps over the sphere, as ``shaders/lib/light/sphere_maps.glsl`` does it.
 
     Parameters
     ----------

@@ -1,11 +1,11 @@
 """An environment for prefiltered lobes: what is small and bright becomes directional lights, the rest is filtered.
 
 A lobe that the horizon cuts is looked up as another lobe with the same integral and centroid
-(:func:`btfref.render.prefilter.clipped_lobes`): good for light that is broad, and tens of percent off for a small one
-near the horizon, such as the sun. So radiance above a threshold is taken out, as P. Debevec did with the sun
-("Rendering Synthetic Objects into Real Scenes", SIGGRAPH 1998; "A Median Cut Algorithm for Light Probe Sampling",
-SIGGRAPH 2006 posters), and lights through the representation itself. Nothing is lost: each cell's power is what stays
-plus what is taken.
+(:func:`btfref.rendering.environment_light.prefilter.clipped_lobes`): good for light that is broad, and tens of
+percent off for a small one near the horizon, such as the sun. So radiance above a threshold is taken out, as P.
+Debevec did with the sun ("Rendering Synthetic Objects into Real Scenes", SIGGRAPH 1998; "A Median Cut Algorithm for
+Light Probe Sampling", SIGGRAPH 2006 posters), and lights through the representation itself. Nothing is lost: each
+cell's power is what stays plus what is taken.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from btfref.conventions import LUMINANCE
-from btfref.render import prefilter
-from btfref.render.environment import cell_angles
-from btfref.render.light_set import LightSet, divided
+from btfref.rendering.environment_light import prefilter
+from btfref.rendering.environment_light.light_set import LightSet, divided
+from btfref.scene.environment import cell_angles
 
 #: Estimated relative error at which the search ends: half of what an image may be off.
 TARGET = 0.02
@@ -40,7 +40,7 @@ BLOCK = 1024
 
 @dataclass(frozen=True)
 class Cells:
-    """Small lights, as :meth:`btfref.render.environment.Environment.cells` gives them, without the picture.
+    """Small lights, as :meth:`btfref.scene.environment.Environment.cells` gives them, without the picture.
 
     Parameters
     ----------
@@ -76,11 +76,11 @@ def split_light(environment, edge, *, cosine, target=TARGET, most=MOST):
 
     Parameters
     ----------
-    environment : btfref.render.environment.Environment
+    environment : btfref.scene.environment.Environment
     edge : float
-        Smallest measured cosine of the light; see :func:`btfref.render.prefilter.moment_maps`.
+        Smallest measured cosine of the light; see :func:`btfref.rendering.environment_light.prefilter.moment_maps`.
     cosine : bool
-        Whether lobes multiply the light's cosine; see :func:`btfref.render.prefilter.clipped_lobes`.
+        Whether lobes multiply the light's cosine; see `prefilter.clipped_lobes`.
     target : float
         Estimated relative RMSE over receivers that is good enough.
     most : int

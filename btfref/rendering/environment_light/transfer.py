@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics import harmonics
-from btfref.numerics.clustering import leading_axes, local_pca
-from btfref.numerics.frames import shading_frame
-from btfref.numerics.lowrank import range_basis
+from btfref.numerics.solvers.clustering import leading_axes, local_pca
+from btfref.numerics.solvers.lowrank import range_basis
+from btfref.numerics.sphere import harmonics
+from btfref.numerics.sphere.frames import shading_frame
 
 #: Rays from a vertex that find what hides the environment: 1024 make steps of 6 degrees, five bands have lobes of 45.
 RAYS = 1024

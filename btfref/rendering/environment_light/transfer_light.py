@@ -13,9 +13,9 @@ from functools import cached_property
 import numpy as np
 
 from btfref import conventions
-from btfref.numerics import harmonics, interpolation
-from btfref.numerics.parabolic import bilinear_stencil, texel_directions
-from btfref.render.harmonic_light import shared_tables, table_coefficients
+from btfref.numerics.sphere import harmonics, interpolation
+from btfref.numerics.sphere.parabolic import bilinear_stencil, texel_directions
+from btfref.rendering.environment_light.harmonic_light import shared_tables, table_coefficients
 
 #: Components of the matrices and of the material while the light moves, as in the paper.
 MOVING = 4, 1

@@ -1,6 +1,6 @@
 """The shader composer: strict nested includes, line numbers that survive, constants from a representation.
 
-A shader is put together from small files. ``#include "lib/table.glsl"`` is replaced by the text of that file,
+A shader is put together from small files. ``#include "lib/lookup/table.glsl"`` is replaced by the text of that file,
 once: later includes of the same file are empty. Names are looked up in the given directories, then in the
 library (``shaders/``). The name ``representation`` stands for the file of the representation that is shown,
 ``environment`` for that of the way in which an environment lights it.

@@ -12,10 +12,10 @@ from functools import cache
 import numpy as np
 
 from btfref.errors import BtfrefError, InputError, MissingDependencyError
-from btfref.render import composer
+from btfref.rendering.gl import composer
 from btfref.representations.lookup import packed_arrays
 
-#: Texels of a row of a table's texture; shaders/lib/table.glsl takes the index apart with the same number.
+#: Texels of a row of a table's texture; shaders/lib/lookup/table.glsl takes the index apart with the same number.
 TABLE_WIDTH = 4096
 
 #: moderngl's name of each type's texture; 8-bit codes are read as code / 255.
@@ -137,7 +137,7 @@ class ShaderRepresentation:
         rep : Representation
         filter_type : {"nearest", "bilinear"}, optional
             Overrides the file's texel filter.
-        light : btfref.render.lighting.Prepared, optional
+        light : btfref.rendering.environment_light.lighting.Prepared, optional
             How an environment lights it: its tables come along.
         """
         defines = shader_defines(rep, filter_type=filter_type)
@@ -205,7 +205,7 @@ def compile_program(ctx, vertex, fragment=None, *, varyings=(), **composition):
     varyings : sequence of str
         Outputs for transform feedback.
     **composition
-        For :func:`btfref.render.composer.compose`.
+        For :func:`btfref.rendering.gl.composer.compose`.
 
     Returns
     -------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.render import gl
+from btfref.rendering.gl import device
 
 
 def probe(rep, uv, w_light, w_view, lod=0.0, *, filter_type=None):
@@ -73,7 +73,7 @@ def probe_environment(rep, light, uv, w_view, to_world, *, filter_type=None):
     Parameters
     ----------
     rep : Representation
-    light : btfref.render.lighting.Prepared
+    light : btfref.rendering.environment_light.lighting.Prepared
         How the environment lights it.
     uv : array_like, shape (N, 2)
     w_view : array_like, shape (N, 3)
@@ -94,7 +94,7 @@ def probe_environment(rep, light, uv, w_view, to_world, *, filter_type=None):
     axes = np.swapaxes(np.asarray(to_world, np.float32), 1, 2).reshape(-1, 9)
     points = np.concatenate([np.asarray(uv, np.float32), np.asarray(w_view, np.float32), axes], 1)
     names = {"uv": 2, "w_view": 3, "axis_x": 3, "axis_y": 3, "axis_z": 3}
-    tables = gl.ShaderRepresentation.upload(gl.context(), rep, filter_type=filter_type, light=light)
+    tables = device.ShaderRepresentation.upload(device.context(), rep, filter_type=filter_type, light=light)
     if not len(points):
         tables.release()
         return np.zeros((0, 3), np.float32)
@@ -111,7 +111,7 @@ class Probe:
 
     Parameters
     ----------
-    tables : btfref.render.gl.ShaderRepresentation
+    tables : btfref.rendering.gl.device.ShaderRepresentation
         Owned from here on.
     host : str
         Vertex shader that writes the result.
@@ -124,7 +124,7 @@ class Probe:
     """
 
     def __init__(self, tables, host, names, points, result=("value", 3)):
-        self.ctx = gl.context()
+        self.ctx = device.context()
         self._owned, self._n = [tables], len(points)
         # Without a bound framebuffer transform feedback on a surfaceless context returns zeros, without an error.
         self._target = self._own(self.ctx.simple_framebuffer((1, 1)))
@@ -155,8 +155,8 @@ class Probe:
     def run(self, uniforms=None):
         """Evaluate all points, with uniforms by name, and wait."""
         self._target.use()
-        gl.bind(self._program, self._textures)
-        gl.set_uniforms(self._program, uniforms or {})
+        device.bind(self._program, self._textures)
+        device.set_uniforms(self._program, uniforms or {})
         self._vertices.transform(self._result, mode=self.ctx.POINTS, vertices=self._n)
         self.ctx.finish()
 
@@ -168,7 +168,7 @@ class Probe:
 def probe_points(rep, points, *, filter_type=None, result=("value", 3)):
     """A :class:`Probe` of ``rep`` at rows of :func:`broadcast_points`; the caller runs and releases it."""
     names = {"uv": 2, "w_light": 3, "w_view": 3, "lod": 1}
-    tables = gl.ShaderRepresentation.upload(gl.context(), rep, filter_type=filter_type)
+    tables = device.ShaderRepresentation.upload(device.context(), rep, filter_type=filter_type)
     return Probe(tables, "hosts/probe.vert", names, points, result)
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.render.shapes import neighbours
+from btfref.scene.shapes import neighbours
 
 
 def lod_uniforms(material, texels, angle):
-    """What ``shaders/lib/lod.glsl`` reads.
+    """What ``shaders/lib/surface/lod.glsl`` reads.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def lod_uniforms(material, texels, angle):
 
 
 def triangle_table(mesh):
-    """Triangles as ``shaders/lib/triangle_table.glsl`` reads them.
+    """Triangles as ``shaders/lib/surface/triangle_table.glsl`` reads them.
 
     Parameters
     ----------
@@ -93,6 +93,6 @@ def clip_planes(camera, meshes):
 
 
 def light_uniforms(lights):
-    """What ``shaders/lib/lights.glsl`` reads of directional and point lights."""
+    """What ``shaders/lib/light/lights.glsl`` reads of directional and point lights."""
     position = [[*light.position, 0.0 if light.kind == "directional" else 1.0] for light in lights]
     return {"light_position": np.array(position), "light_power": np.array([light.power for light in lights])}

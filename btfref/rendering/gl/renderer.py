@@ -1,9 +1,9 @@
 """The real-time renderer: the same scene through GLSL, without a window.
 
-Direct light of directional and point lights and of an environment (:mod:`btfref.render.lighting`), without cast
-shadows; the environment itself is not drawn. The sub-pixel grid is the one of the noise-free reference
-(:mod:`btfref.render.reference`): n × n regular samples a pixel, box filter. Each sample is one frame with a shifted
-projection; frames are added in float64.
+Direct light of directional and point lights and of an environment
+(:mod:`btfref.rendering.environment_light.lighting`), without cast shadows; the environment itself is not drawn. The
+sub-pixel grid is the one of the noise-free reference (:mod:`btfref.rendering.offline.reference`): n × n regular
+samples a pixel, box filter. Each sample is one frame with a shifted projection; frames are added in float64.
 """
 
 from __future__ import annotations
@@ -13,13 +13,19 @@ import time
 import numpy as np
 
 from btfref import representations
-from btfref.demand import MARGIN, kept_maps
 from btfref.errors import BtfrefError, InputError
-from btfref.render import gl
-from btfref.render.lighting import lighting_of
-from btfref.render.raster import clip_planes, light_uniforms, lod_uniforms, triangle_table, world_to_clip
-from btfref.render.result import RenderResult
-from btfref.render.scene import SceneDescription, read_scene
+from btfref.rendering.environment_light.lighting import lighting_of
+from btfref.rendering.gl import device
+from btfref.rendering.gl.raster import (
+    clip_planes,
+    light_uniforms,
+    lod_uniforms,
+    triangle_table,
+    world_to_clip,
+)
+from btfref.rendering.result import RenderResult
+from btfref.scene.demand import MARGIN, kept_maps
+from btfref.scene.description import SceneDescription, read_scene
 
 
 def realtime(
@@ -51,14 +57,14 @@ def realtime(
         "needed" keeps only the maps in memory that the camera's first hits need: views, lights, levels of detail,
         entries of codebooks; the picture is the same. Asks Mitsuba for the camera's rays; not for a `SceneDescription`.
     environment : str
-        Way in which the scene's environment lights: see :class:`btfref.render.lighting.Lighting`.
+        Way in which the scene's environment lights: see :class:`btfref.rendering.environment_light.lighting.Lighting`.
     lights : int, optional
         Directional lights that stand for the environment; by default as many as it needs for an estimated error of 1 %.
     order : int, optional
         Bands of spherical harmonics; default 5.
     window : {"none", "hanning", "lanczos"}, optional
         That damps their ringing.
-    transfer : btfref.render.transfer.TransferSettings, optional
+    transfer : btfref.rendering.environment_light.transfer.TransferSettings, optional
         Of the way "transfer".
     count_fetches : bool
         Count the texels that the representations fetch: ``meta["fetches"]``, the mean over covered samples.
@@ -76,7 +82,7 @@ def realtime(
     Raises
     ------
     InputError
-        For a scene that cannot be read (see :func:`btfref.render.scene.read_scene`), without lights, with a shape
+        For a scene that cannot be read (see :func:`btfref.scene.description.read_scene`), without lights, with a shape
         that has no BTF, or with a way to light by the environment that a method lacks.
     MissingDependencyError
         Without an OpenGL driver.
@@ -123,7 +129,7 @@ def realtime(
             "resident_entries": _count(needed, "entries"),
             "resident_levels": _count(needed, "levels"),
             **renderer.environment_facts,
-            **gl.facts(renderer.ctx),
+            **device.facts(renderer.ctx),
         }
         if count_fetches:
             counts = np.stack(fetches)
@@ -151,7 +157,7 @@ class Renderer:
     scene : SceneDescription
     load_file : callable, optional
         ``path -> Representation``; the default reads the files.
-    lighting : btfref.render.lighting.Lighting, optional
+    lighting : btfref.rendering.environment_light.lighting.Lighting, optional
         Of the scene's environment; default: "auto".
     count_fetches : bool
         Have :meth:`fetches` tell the texels fetched; a little slower.
@@ -166,7 +172,7 @@ class Renderer:
                 raise InputError(
                     "real-time rendering needs a btf material", file=where, field="bsdf", got=mesh.bsdf
                 )
-        self.ctx = gl.context()
+        self.ctx = device.context()
         self.camera = scene.camera
         self._owned, self._shown, self._meshes = [], {}, []
         size = (self.camera.width, self.camera.height)
@@ -214,7 +220,7 @@ class Renderer:
             if self._lighting is not None:
                 light = self._lighting.prepared(rep, file=material.filename, mesh=own)
                 self._light_facts[material.filename] = {"environment_path": light.path, **light.facts}
-            shown = gl.ShaderRepresentation.upload(
+            shown = device.ShaderRepresentation.upload(
                 self.ctx, rep, filter_type=material.filter_type, light=light
             )
             defines = {"N_LIGHTS": self._n_lights, **self._counting}
@@ -226,7 +232,7 @@ class Renderer:
             program = shown.program(self.ctx, vertex, "hosts/mesh.frag", defines=defines)
             self._own(program), self._own(shown)
             self._shown[key] = shown, program, self._own(self.ctx.vertex_array(program, [])), light
-        table = self._own(gl.upload(self.ctx, triangle_table(mesh), "triangles"))
+        table = self._own(device.upload(self.ctx, triangle_table(mesh), "triangles"))
         self._meshes.append((mesh, key, table))
 
     def _make_seen(self):
@@ -235,7 +241,7 @@ class Renderer:
             size = (self.camera.width, self.camera.height)
             texture = self._own(self.ctx.texture(size, 2, dtype="f4"))
             target = self._own(self.ctx.framebuffer([texture], self._own(self.ctx.depth_renderbuffer(size))))
-            program = self._own(gl.compile_program(self.ctx, "hosts/mesh.vert", "hosts/seen.frag"))
+            program = self._own(device.compile_program(self.ctx, "hosts/mesh.vert", "hosts/seen.frag"))
             self._seen = texture, target, program, self._own(self.ctx.vertex_array(program, []))
 
     def _fill_seen(self, common):
@@ -244,15 +250,15 @@ class Renderer:
         target.use()
         target.clear(0.0, 0.0, 0.0, 0.0)
         for number, (mesh, _, table) in enumerate(self._meshes):
-            gl.bind(program, {"triangles": table})
-            gl.set_uniforms(program, {**common, "mesh": number})
+            device.bind(program, {"triangles": table})
+            device.set_uniforms(program, {**common, "mesh": number})
             vertices.render(self.ctx.TRIANGLES, vertices=3 * len(mesh.faces))
         self._target.use()
 
     def _depth_program(self):
         """Black surfaces: what fills the depth buffer before pictures are added up."""
         if self._depth is None:
-            program = self._own(gl.compile_program(self.ctx, "hosts/mesh.vert", "hosts/depth.frag"))
+            program = self._own(device.compile_program(self.ctx, "hosts/mesh.vert", "hosts/depth.frag"))
             self._depth = program, self._own(self.ctx.vertex_array(program, []))
         return self._depth
 
@@ -302,21 +308,21 @@ class Renderer:
                 if by_pixel:
                     tables["seen"] = self._seen[0]
                     ctx.depth_func, self._target.depth_mask = ">", False
-                gl.bind(program, tables)
+                device.bind(program, tables)
                 row0, row1 = mesh.material.to_uv
                 own = {"uv_row0": row0, "uv_row1": row1, "scale": mesh.material.scale}
                 own["uv_rotation"] = mesh.material.rotation
                 own["mesh"] = index
                 own |= lod_uniforms(mesh.material, shown.texels, share * camera.pixel_angle)
-                gl.set_uniforms(program, {**common, **own, "two_sided": mesh.material.twosided})
+                device.set_uniforms(program, {**common, **own, "two_sided": mesh.material.twosided})
                 passes, counts = ({},), [len(mesh.faces)]
                 if light is not None:
                     passes, counts = light.passes, counts * len(light.passes)
                     if light.bins is not None:
                         counts = np.diff(light.bins).tolist()
-                        gl.set_uniforms(program, {"transfer_components": light.transfer.table.shape[3]})
+                        device.set_uniforms(program, {"transfer_components": light.transfer.table.shape[3]})
                 for number, (values, count) in enumerate(zip(passes, counts, strict=True)):
-                    gl.set_uniforms(program, {**values, "pass": number})
+                    device.set_uniforms(program, {**values, "pass": number})
                     vertices.render(ctx.TRIANGLES, vertices=3 if by_pixel else 3 * count)
                 if by_pixel:
                     ctx.depth_func, self._target.depth_mask = "<=", True
@@ -327,7 +333,7 @@ class Renderer:
 
     @property
     def transfers(self):
-        """What can be lit anew, one :class:`btfref.render.transfer_light.TransferLight` a mesh."""
+        """What can be lit anew, one :class:`btfref.rendering.environment_light.transfer_light.TransferLight` a mesh."""
         lights = [light for *_, light in self._shown.values()]
         return [light.transfer for light in lights if light is not None and light.transfer is not None]
 
@@ -343,8 +349,8 @@ class Renderer:
         ctx = self.ctx
         program, vertices = self._depth_program()
         for mesh, _, table in self._meshes:
-            gl.bind(program, {"triangles": table})
-            gl.set_uniforms(program, common)
+            device.bind(program, {"triangles": table})
+            device.set_uniforms(program, common)
             vertices.render(ctx.TRIANGLES, vertices=3 * len(mesh.faces))
         ctx.depth_func = "<="
         ctx.enable(ctx.BLEND)
@@ -355,7 +361,7 @@ class Renderer:
 
         Parameters
         ----------
-        environment : btfref.render.environment.Environment
+        environment : btfref.scene.environment.Environment
         moving : bool
             Few components of matrices and materials, as while a light is dragged; the next call without it refines.
 
@@ -371,7 +377,7 @@ class Renderer:
             light.transfer.relight(coefficients, moving=moving)
             for name, table in light.transfer.tables().items():
                 shown.textures.pop(name).release()
-                shown.textures[name] = gl.upload(self.ctx, table, name)
+                shown.textures[name] = device.upload(self.ctx, table, name)
 
     def read(self):
         """The frame, float32 (H, W, 3), row 0 at the top."""

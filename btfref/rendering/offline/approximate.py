@@ -13,16 +13,16 @@ import numpy as np
 from btfref import representations
 from btfref.errors import InputError
 from btfref.numerics.footprint import ANISOTROPY, probe_weight
-from btfref.render.lighting import lighting_of
-from btfref.render.result import RenderResult
-from btfref.render.scene import read_scene
-from btfref.render.visible import visible_points
+from btfref.rendering.environment_light.lighting import lighting_of
+from btfref.rendering.result import RenderResult
+from btfref.scene.description import read_scene
+from btfref.scene.visible import visible_points
 
 
 def approximate(
     scene, *, parameters=None, path="auto", grid=4, size=None, load_file=None, pixels=None, **options
 ):
-    """What :func:`btfref.render.realtime.realtime` approximates, evaluated in float64.
+    """What :func:`btfref.rendering.gl.renderer.realtime` approximates, evaluated in float64.
 
     Parameters
     ----------

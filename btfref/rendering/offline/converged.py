@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from btfref.compare import significance
-from btfref.compare.tolerances import gate_table, tolerance
-from btfref.render.camera import tell_camera
-from btfref.render.loading import loaded
-from btfref.render.reference import BATCHES, traced
+from btfref.comparison import significance
+from btfref.gates.tolerances import gate_table, tolerance
+from btfref.rendering.offline.reference import BATCHES, traced
+from btfref.scene.camera import tell_camera
+from btfref.scene.loading import loaded
 
 #: Samples a pixel of the first round, and most of all rounds.
 FIRST, MOST = 256, 1 << 16
@@ -45,7 +45,7 @@ def converged(
     size : (int, int), optional
     seed : int
     shadows, grid
-        As of :func:`btfref.render.reference.render`.
+        As of :func:`btfref.rendering.offline.reference.render`.
     most : int
         Samples a pixel at which the search ends, whatever the noise: the gate is then inconclusive at worst.
     progress : callable, optional

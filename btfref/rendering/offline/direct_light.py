@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.render.camera import film_rays, grid_offsets
+from btfref.scene.camera import film_rays, grid_offsets
 
 #: Camera rays times samples that are traced at a time.
 LANES = 1 << 22

@@ -4,7 +4,7 @@ A BTF stands for an infinitely tiled, flat mesostructure that is seen and lit fr
 asks that mesostructure itself, at the exact place and the exact directions of every camera ray, by paths with next
 event estimation (Kajiya 1986), where a representation interpolates between sampled texels and directions. What
 bending the mesostructure around the shape would change is beyond any BTF and is left out on both sides;
-:mod:`btfref.render.geometry` shows it for flat scenes, borders and all.
+:mod:`btfref.rendering.offline.geometry` shows it for flat scenes, borders and all.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import time
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.render.camera import film_rays
-from btfref.render.loading import loaded
-from btfref.render.result import RenderResult
-from btfref.render.scene import read_scene
+from btfref.rendering.result import RenderResult
+from btfref.scene.camera import film_rays
+from btfref.scene.description import read_scene
+from btfref.scene.loading import loaded
 
 #: Independent pictures that the result is the mean of.
 BATCHES = 4
@@ -59,7 +59,7 @@ def render_exact(
     InputError
         For other lights or materials, or a BTF that does not say which mesostructure it shows.
     """
-    from btfref.render.geometry import mesostructure_of
+    from btfref.rendering.offline.geometry import mesostructure_of
     from btfref.sampling.tiled_scene import TiledScene
 
     for name, value, least in (("spp", spp, 1), ("grid", grid, 1), ("batches", batches, 2)):
@@ -143,7 +143,7 @@ def _vertex(tiles, state, number, keys, samples):
     import drjit as dr
     import mitsuba as mi
 
-    from btfref.sampling.path_estimator import ROULETTE_LIMIT, ROULETTE_VERTEX
+    from btfref.sampling.paths.estimator import ROULETTE_LIMIT, ROULETTE_VERTEX
     from btfref.sampling.tiled_scene import uniforms
 
     lane, origin, direction, throughput, lights = state

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.render.result import RenderResult
-from btfref.render.scene import read_scene
+from btfref.rendering.result import RenderResult
+from btfref.scene.description import read_scene
 
 #: Independent renders that a picture is the mean of; their spread gives the variance.
 ROUNDS = 16
@@ -96,8 +96,8 @@ def render_geometry(
     import time
 
     from btfref.mesostructure.tiling import tiled_shapes
+    from btfref.provenance import versions
     from btfref.sampling.variant import mitsuba_variant
-    from btfref.versions import versions
 
     if not isinstance(spp, int | np.integer) or spp < 2:
         raise InputError("samples per pixel", field="spp", got=spp, expected="a whole number, at least 2")
@@ -256,7 +256,7 @@ def _plane(description):
 
 def _parent(filename):
     """Mesostructure and depth that the BTF behind a representation was made from."""
-    from btfref.representations.container import read_info
+    from btfref.representations.file.container import read_info
 
     ancestor = read_info(filename)["parent"]
     depth = ancestor.get("parameters", {}).get("max_depth", 8)

@@ -7,10 +7,10 @@ import time
 import numpy as np
 
 from btfref.errors import BtfrefError, InputError
-from btfref.render.camera import film_rays, grid_offsets, tell_camera
-from btfref.render.loading import loaded
-from btfref.render.result import RenderResult
+from btfref.rendering.result import RenderResult
 from btfref.sampling.variant import no_collection
+from btfref.scene.camera import film_rays, grid_offsets, tell_camera
+from btfref.scene.loading import loaded
 
 #: Independent renders whose spread gives the variance of the mean: 15 degrees of freedom.
 BATCHES = 16
@@ -88,7 +88,7 @@ def render(
         raise InputError("unknown choice of maps", field="maps", got=maps, expected="all or needed")
     kept = {}
     if maps == "needed":
-        from btfref.demand import MARGIN, kept_maps
+        from btfref.scene.demand import MARGIN, kept_maps
 
         lit = noise_free is not None
         kept = kept_maps(
@@ -138,7 +138,7 @@ def traced(made, *, spp=None, seed=0, noise_free=None, shadows=True, with_varian
         image, variance = _noise_free(made, noise_free, shadows), None
         settings = {"noise_free": noise_free, "shadows": shadows, "integrator": "noise-free direct"}
     elif grid is not None:
-        from btfref.render.direct_light import regular
+        from btfref.rendering.offline.direct_light import regular
 
         pictures, variance, spp = regular(made, grid, spp, seed, shadows)
         image = pictures.mean(0)
@@ -161,7 +161,7 @@ def traced(made, *, spp=None, seed=0, noise_free=None, shadows=True, with_varian
 def _monte_carlo(scene, spp, seed, with_variance, shadows):
     import mitsuba as mi
 
-    from btfref.render.direct_light import make_integrator
+    from btfref.rendering.offline.direct_light import make_integrator
 
     integrator = scene.integrator() if shadows else make_integrator(shadows=False)
     if integrator is None:
@@ -250,6 +250,6 @@ def direct(scene, ray, shadows):
 
 
 def _versions():
-    from btfref.versions import versions
+    from btfref.provenance import versions
 
     return {"versions": versions()}

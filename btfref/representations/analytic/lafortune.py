@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.numerics.levenberg import BatchFit, fit_batch
 from btfref.numerics.powers import FLOOR, safe_power
-from btfref.numerics.precision import real
-from btfref.representations import analytic
-from btfref.representations.lobe_start import exponent_limit
+from btfref.numerics.solvers.levenberg import BatchFit, fit_batch
+from btfref.precision import real
+from btfref.representations.analytic import light_functions
+from btfref.representations.analytic.lobe_start import exponent_limit
 from btfref.representations.lookup import base_meta, direction_arrays, positive_integer, stored
 
 #: "paper": Table 1's four lobes, in floats.
@@ -35,7 +35,7 @@ STARTS = (
 )
 
 
-class Representation(analytic.AnalyticMaps):
+class Representation(light_functions.AnalyticMaps):
     """``lobes`` [row, column, 4 k]: coefficients and exponent of each lobe; ``peaks`` [row, column, k];
     ``colour`` [row, column, 4]: chroma and ρ_d in 1/sr; and the direction tables.
     """  # noqa: D205
@@ -48,7 +48,7 @@ class Representation(analytic.AnalyticMaps):
             value = texel_values(maps, s)
             return np.einsum("nt,ntc,nt->nc", s.texel_weight, maps["colour"][s.texel, :3], value)
 
-        return analytic.evaluate_analytic(self, kernel, uv, w_light, w_view)
+        return light_functions.evaluate_analytic(self, kernel, uv, w_light, w_view)
 
     def luminance_tables(self, texels, views):
         """Model of luminance at measured views and all measured lights, shape (n, n_views, n_lights)."""
@@ -90,7 +90,7 @@ def lafortune_model(module, data, views, lights, n_lobes, factor=None):
     Parameters
     ----------
     module : module
-        Of :func:`btfref.numerics.levenberg.backend`.
+        Of :func:`btfref.numerics.solvers.levenberg.backend`.
     data : ndarray of float32, shape (N, n_views, n_lights)
         Luminance.
     views, lights : ndarray, shape (n, 3)
@@ -172,9 +172,9 @@ def fit_lafortune(luminance, views, lights, n_lobes, *, start=None, factor=None,
 
     Returns
     -------
-    btfref.numerics.levenberg.BatchFit
+    btfref.numerics.solvers.levenberg.BatchFit
     """
-    from btfref.numerics.levenberg import backend
+    from btfref.numerics.solvers.levenberg import backend
 
     first, lower, upper = bounds(luminance, lights, n_lobes)
     factor = None if factor is None else factor.T
@@ -220,9 +220,9 @@ def fit(btf, *, seed=0, progress=None, lobes=4, storage="half", filter_type="bil
     Returns
     -------
     Representation
-        ``meta["fit"]`` holds ``epsilon`` (see :func:`analytic.fit_report`), the counts of
-        :attr:`btfref.numerics.levenberg.BatchFit.summary` ``not_converged_at``, up to 1000 texels,
-        and ``memory`` (see :func:`analytic.memory_report`).
+        ``meta["fit"]`` holds ``epsilon`` (see :func:`light_functions.fit_report`), the counts of
+        :attr:`btfref.numerics.solvers.levenberg.BatchFit.summary` ``not_converged_at``, up to 1000 texels,
+        and ``memory`` (see :func:`light_functions.memory_report`).
 
     Raises
     ------
@@ -240,7 +240,7 @@ def fit(btf, *, seed=0, progress=None, lobes=4, storage="half", filter_type="bil
     parameters = {"lobes": n_lobes, "storage": storage, "seed": seed}
     maps, meta = fit_texels("lafortune", btf, fit_block, parameters, progress, storage, filter_type)
     result = Representation(maps, meta)
-    meta["fit"]["epsilon"] = analytic.fit_report(result, btf)
+    meta["fit"]["epsilon"] = light_functions.fit_report(result, btf)
     return result
 
 
@@ -254,7 +254,7 @@ def fit_texels(method, btf, fit_block, parameters, progress, storage, filter_typ
     """
     rows, columns = btf.values.shape[2:4]
     blocks, fits = [], []
-    for _, luminance, chroma in analytic.luminance_blocks(btf, progress, "lobes"):
+    for _, luminance, chroma in light_functions.luminance_blocks(btf, progress, "lobes"):
         result, further = fit_block(luminance)
         lobes, peaks, diffuse = lobe_maps(result.parameters)
         colour = np.concatenate([chroma, diffuse[:, None]], 1)
@@ -266,8 +266,8 @@ def fit_texels(method, btf, fit_block, parameters, progress, storage, filter_typ
         *(np.concatenate([getattr(f, name) for f in fits]) for name in BatchFit.__dataclass_fields__)
     )
     meta = base_meta(method, btf, parameters, filter_type=filter_type)
-    meta["constants"] = analytic.edge_constants(btf) | {"n_lobes": parameters["lobes"]}
+    meta["constants"] = light_functions.edge_constants(btf) | {"n_lobes": parameters["lobes"]}
     failed = np.flatnonzero(~everything.converged)
-    memory = analytic.memory_report(maps, rows * columns)
+    memory = light_functions.memory_report(maps, rows * columns)
     meta["fit"] = everything.summary | {"not_converged_at": failed[:1000].tolist(), "memory": memory}
     return maps | direction_arrays(btf.views, btf.lights), meta

@@ -2,7 +2,7 @@
 
 Sources: K. Daubert et al., "Efficient Cloth Modeling and Rendering", EGWR 2001: the factor stands for what the texel
 shows of itself to a view (self-occlusion); Meseth, Müller, Klein 2004, Table 1. Lobes: see
-:mod:`btfref.representations.lafortune`.
+:mod:`btfref.representations.analytic.lafortune`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from btfref.representations import analytic, lafortune
+from btfref.representations.analytic import lafortune, light_functions
 from btfref.representations.lookup import positive_integer
 
 #: "paper": Table 1's four lobes, in floats.
@@ -21,10 +21,10 @@ PRESETS = {"paper": {"lobes": 4, "storage": "float"}}
 FACTOR_BOUND = 8.0
 
 
-class Representation(analytic.AnalyticMaps):
-    """Maps of :class:`btfref.representations.lafortune.Representation` and ``factor`` [row, column, view]."""
+class Representation(light_functions.AnalyticMaps):
+    """Maps of :class:`btfref.representations.analytic.lafortune.Representation` and ``factor`` [row, column, view]."""
 
-    #: Maps by view; see :mod:`btfref.representations.resident`.
+    #: Maps by view; see :mod:`btfref.representations.file.resident`.
     VIEW_AXES: ClassVar = {"factor": 2}
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
@@ -41,7 +41,7 @@ class Representation(analytic.AnalyticMaps):
             value = factor * lafortune.texel_values(maps, s)
             return np.einsum("nt,ntc,nt->nc", s.texel_weight, maps["colour"][s.texel, :3], value)
 
-        return analytic.evaluate_analytic(self, kernel, uv, w_light, w_view)
+        return light_functions.evaluate_analytic(self, kernel, uv, w_light, w_view)
 
     def luminance_tables(self, texels, views):
         """Model of luminance at measured views and all measured lights, shape (n, n_views, n_lights)."""
@@ -69,7 +69,7 @@ def fit(btf, *, seed=0, progress=None, lobes=4, rounds=1, storage="half", filter
     Returns
     -------
     Representation
-        ``meta["fit"]`` as for :func:`btfref.representations.lafortune.fit`.
+        ``meta["fit"]`` as for :func:`btfref.representations.analytic.lafortune.fit`.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def fit(btf, *, seed=0, progress=None, lobes=4, rounds=1, storage="half", filter
         "lafortune_lut", btf, fit_block, parameters, progress, storage, filter_type
     )
     result = Representation(maps, meta)
-    meta["fit"]["epsilon"] = analytic.fit_report(result, btf)
+    meta["fit"]["epsilon"] = light_functions.fit_report(result, btf)
     return result
 
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from btfref import conventions
 from btfref.errors import InputError
-from btfref.numerics import interpolation
-from btfref.numerics.precision import real
+from btfref.numerics.sphere import interpolation
+from btfref.precision import real
 from btfref.representations.guide import feature_views, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points
 

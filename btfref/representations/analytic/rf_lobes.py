@@ -16,11 +16,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from btfref.numerics.levenberg import fit_batch
 from btfref.numerics.powers import FLOOR, safe_power, unit_lobe
-from btfref.numerics.precision import real
-from btfref.representations import analytic
-from btfref.representations.lobe_start import exponent_limit, lobe_starts, tilted_starts
+from btfref.numerics.solvers.levenberg import fit_batch
+from btfref.precision import real
+from btfref.representations.analytic import light_functions
+from btfref.representations.analytic.lobe_start import (
+    exponent_limit,
+    lobe_starts,
+    tilted_starts,
+)
 from btfref.representations.lookup import base_meta, direction_arrays, positive_integer, stored
 
 #: "paper": two lobes in floats.
@@ -49,12 +53,12 @@ FTOL = 1e-4
 DIFFUSE_QUANTILE = 0.1
 
 
-class Representation(analytic.AnalyticMaps):
+class Representation(light_functions.AnalyticMaps):
     """``lobes`` [row, column, view, 4 k]: parabolic axis (s, t), exponent, peak of each; ``colour`` [row, column, 4]:
     chroma and diffuse albedo ρ_d in 1/sr; and the direction tables.
     """  # noqa: D205
 
-    #: Maps by view; see :mod:`btfref.representations.resident`.
+    #: Maps by view; see :mod:`btfref.representations.file.resident`.
     VIEW_AXES: ClassVar = {"lobes": 2}
     ROWS_BY: ClassVar = {"lobes": (2,)}
 
@@ -71,7 +75,7 @@ class Representation(analytic.AnalyticMaps):
             value += s.texel_weight * at[..., 3] * s.w_light[:, None, 2]
             return np.einsum("nt,ntc->nc", value, at[..., :3])
 
-        return analytic.evaluate_analytic(self, kernel, uv, w_light, w_view)
+        return light_functions.evaluate_analytic(self, kernel, uv, w_light, w_view)
 
     def _lobes(self):
         """Lobes by flat texel and view, shape (n_texels, n_views, k, 4)."""
@@ -109,7 +113,7 @@ def lobe_model(module, data, lights, n_lobes):
     Parameters
     ----------
     module : module
-        Of :func:`btfref.numerics.levenberg.backend`.
+        Of :func:`btfref.numerics.solvers.levenberg.backend`.
     data : ndarray of float32, shape (N, n_lights)
         Luminance of N fits.
     lights : ndarray, shape (n_lights, 3)
@@ -201,9 +205,9 @@ def fit(
     Returns
     -------
     Representation
-        ``meta["fit"]`` holds ``epsilon`` (see :func:`analytic.fit_report`), the counts of
-        :attr:`btfref.numerics.levenberg.BatchFit.summary`, ``not_converged_at``: up to 1000 pairs (texel, view),
-        and ``memory`` (see :func:`analytic.memory_report`).
+        ``meta["fit"]`` holds ``epsilon`` (see :func:`light_functions.fit_report`), the counts of
+        :attr:`btfref.numerics.solvers.levenberg.BatchFit.summary`, ``not_converged_at``: up to 1000 pairs (texel,
+        view), and ``memory`` (see :func:`light_functions.memory_report`).
 
     Raises
     ------
@@ -219,7 +223,7 @@ def fit(
         "colour": np.zeros((rows * columns, 4), np.float32),
     }
     summaries, failed = [], []
-    for part, luminance, chroma in analytic.luminance_blocks(btf, progress, "lobes"):
+    for part, luminance, chroma in light_functions.luminance_blocks(btf, progress, "lobes"):
         diffuse = diffuse_albedo(luminance, btf.lights.vectors, diffuse_quantile)
         data = luminance - (diffuse * btf.lights.vectors[:, 2, None]).astype(np.float32)
         n = data.shape[2]
@@ -235,12 +239,12 @@ def fit(
     maps = {name: stored(name, array.reshape(shapes[name]), storage) for name, array in maps.items()}
     parameters = {"lobes": n_lobes, "diffuse_quantile": diffuse_quantile, "storage": storage, "seed": seed}
     meta = base_meta("rf_lobes", btf, parameters, filter_type=filter_type)
-    meta["constants"] = analytic.edge_constants(btf) | {"n_lobes": n_lobes}
+    meta["constants"] = light_functions.edge_constants(btf) | {"n_lobes": n_lobes}
     result = Representation(maps | direction_arrays(btf.views, btf.lights), meta)
     meta["fit"] = merged(summaries) | {
         "not_converged_at": failed[:1000],
-        "epsilon": analytic.fit_report(result, btf),
-        "memory": analytic.memory_report(maps, rows * columns, n_views),
+        "epsilon": light_functions.fit_report(result, btf),
+        "memory": light_functions.memory_report(maps, rows * columns, n_views),
     }
     return result
 
@@ -292,10 +296,10 @@ def fit_lobes(data, lights, n_lobes, *, iterations=100, high_pass=False, restart
 
     Returns
     -------
-    btfref.numerics.levenberg.BatchFit
+    btfref.numerics.solvers.levenberg.BatchFit
         Parameters (s, t, natural logarithm of the exponent, peak) of each lobe.
     """
-    from btfref.numerics.levenberg import backend
+    from btfref.numerics.solvers.levenberg import backend
 
     module = backend()
 

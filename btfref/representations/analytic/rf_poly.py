@@ -15,8 +15,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from btfref.numerics.precision import real
-from btfref.representations import analytic
+from btfref.precision import real
+from btfref.representations.analytic import light_functions
 from btfref.representations.lookup import base_meta, direction_arrays, stored
 
 #: "paper": all 81 views in floats.
@@ -33,10 +33,10 @@ def terms(w_light):
     return np.stack([x * x, y * y, x * y, x, y, z * z], -1)
 
 
-class Representation(analytic.AnalyticMaps):
+class Representation(light_functions.AnalyticMaps):
     """``polynomial`` [row, column, view, 6], ``chroma`` [row, column, 3], and the direction tables."""
 
-    #: Maps by view; see :mod:`btfref.representations.resident`.
+    #: Maps by view; see :mod:`btfref.representations.file.resident`.
     VIEW_AXES: ClassVar = {"polynomial": 2}
     ROWS_BY: ClassVar = {"polynomial": (2,)}
 
@@ -55,7 +55,7 @@ class Representation(analytic.AnalyticMaps):
             value = np.einsum("ntv,nt,nv->nt", value, s.texel_weight, s.view_weight)
             return np.einsum("nt,ntc->nc", value, chroma[s.texel])
 
-        return analytic.evaluate_analytic(self, kernel, uv, w_light, w_view)
+        return light_functions.evaluate_analytic(self, kernel, uv, w_light, w_view)
 
     def luminance_tables(self, texels, views):
         """Model of luminance at measured views and all measured lights, shape (n, n_views, n_lights)."""
@@ -103,8 +103,8 @@ def fit(btf, *, seed=0, progress=None, storage="half", filter_type="bilinear"):
     Returns
     -------
     Representation
-        ``meta["fit"]`` holds ``epsilon`` (see :func:`analytic.fit_report`), ``rank`` and ``condition``,
-        ``memory`` (see :func:`analytic.memory_report`).
+        ``meta["fit"]`` holds ``epsilon`` (see :func:`light_functions.fit_report`), ``rank`` and ``condition``,
+        ``memory`` (see :func:`light_functions.memory_report`).
 
     Raises
     ------
@@ -116,7 +116,7 @@ def fit(btf, *, seed=0, progress=None, storage="half", filter_type="bilinear"):
     n_views, _, rows, columns, _ = btf.values.shape
     polynomial = np.zeros((rows * columns, n_views, 6), np.float32)
     chroma = np.zeros((rows * columns, 3))
-    for part, luminance, colour in analytic.luminance_blocks(btf, progress, "polynomials"):
+    for part, luminance, colour in light_functions.luminance_blocks(btf, progress, "polynomials"):
         polynomial[part] = np.einsum("kl,vln->nvk", operator.astype(np.float32), luminance, optimize=True)
         chroma[part] = colour
     maps = {
@@ -124,8 +124,8 @@ def fit(btf, *, seed=0, progress=None, storage="half", filter_type="bilinear"):
         "chroma": stored("chroma", chroma.reshape(rows, columns, 3), storage),
     }
     meta = base_meta("rf_poly", btf, {"storage": storage, "seed": seed}, filter_type=filter_type)
-    meta["constants"] = analytic.edge_constants(btf)
+    meta["constants"] = light_functions.edge_constants(btf)
     result = Representation(maps | direction_arrays(btf.views, btf.lights), meta)
-    memory = analytic.memory_report(maps, rows * columns, n_views)
-    meta["fit"] = conditioning | {"epsilon": analytic.fit_report(result, btf), "memory": memory}
+    memory = light_functions.memory_report(maps, rows * columns, n_views)
+    meta["fit"] = conditioning | {"epsilon": light_functions.fit_report(result, btf), "memory": memory}
     return result

@@ -12,8 +12,7 @@ import itertools
 
 import numpy as np
 
-from btfref.numerics.directions import DirectionSet, ring_directions
-from btfref.numerics.factoring import (
+from btfref.numerics.solvers.factoring import (
     TINY,
     FactorOperators,
     map_operators,
@@ -22,16 +21,17 @@ from btfref.numerics.factoring import (
     sample_weights,
     sparse_operator,
 )
-from btfref.numerics.halfway import half_difference, in_out
-from btfref.numerics.parabolic import texel_directions
-from btfref.representations.factored import Representation, light_fade, texel_parts
-from btfref.representations.factored_fit import (
+from btfref.numerics.sphere.directions import DirectionSet, ring_directions
+from btfref.numerics.sphere.halfway import half_difference, in_out
+from btfref.numerics.sphere.parabolic import texel_directions
+from btfref.representations.factored.definition import Representation, light_fade, texel_parts
+from btfref.representations.factored.fit import (
     Factors,
     checked_map_size,
     checked_ranges,
     factorized,
 )
-from btfref.representations.factored_storage import Storing, fitted
+from btfref.representations.factored.storage import Storing, fitted
 from btfref.representations.lookup import positive_integer
 
 __all__ = ["PRESETS", "Representation", "fit"]
@@ -214,7 +214,7 @@ def fit(
     difference, terms, sweeps, exponent, floor, half_step, map_size
         Of the factorization: see :func:`factorize`.
     clusters, storage, scale_storage, code, rescale, filter_type
-        See :class:`btfref.representations.factored_storage.Storing`.
+        See :class:`btfref.representations.factored.storage.Storing`.
 
     Returns
     -------
@@ -284,7 +284,7 @@ def factorize(
 
     Returns
     -------
-    btfref.representations.factored_fit.Factors
+    btfref.representations.factored.fit.Factors
     """
     terms, map_size = positive_integer("terms", terms), checked_map_size(map_size)
     checked_ranges(

@@ -13,10 +13,10 @@ from __future__ import annotations
 import numpy as np
 
 from btfref import conventions
-from btfref.numerics.factoring import map_operators
-from btfref.numerics.halfway import half_difference
-from btfref.numerics.parabolic import bilinear_stencil
-from btfref.numerics.precision import precision, real
+from btfref.numerics.solvers.factoring import map_operators
+from btfref.numerics.sphere.halfway import half_difference
+from btfref.numerics.sphere.parabolic import bilinear_stencil
+from btfref.precision import precision, real
 from btfref.representations.guide import N_GROUPS, feature_views, group_means, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points
 
@@ -92,7 +92,7 @@ class Representation(StoredMaps):
         return scale, np.ones((len(scale), 1, 3), scale.dtype)
 
     def factors(self, texels):
-        """Factors of some texels with their scales, as :class:`~btfref.numerics.factoring.FactorOperators` reads them.
+        """Factors of some texels with their scales, as `FactorOperators` reads them.
 
         Parameters
         ----------

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.representations.factored import texel_parts
+from btfref.representations.factored.definition import texel_parts
 from btfref.representations.lookup import positive_integer
 
 
@@ -21,7 +21,7 @@ class Factors:
     maps : dict of str to ndarray of float32
         "p", "q", "r" and perhaps "d", shape (texel, term, n, n, 3), non-negative; P holds the scale.
     exponent : float
-        Of the weights of errors; see :func:`btfref.numerics.factoring.sample_weights`.
+        Of the weights of errors; see :func:`btfref.numerics.solvers.factoring.sample_weights`.
     parameters : dict
         Of the factorization, for the file.
     facts : dict
@@ -74,7 +74,7 @@ def factorized(btf, counts, map_size, step, factorize):
         Terms of each factor.
     map_size : int
     step : callable
-        ``step(label)``, called for each of :func:`~btfref.representations.factored.texel_parts`.
+        ``step(label)``, called for each of :func:`~btfref.representations.factored.definition.texel_parts`.
     factorize : callable
         ``data -> (maps, models)``: of :func:`unit_tables`, the maps (term, n², m) of tables of mean 1, and
         approximations of these tables by name. P gets the mean here.

@@ -11,17 +11,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.numerics.factoring import map_operators
-from btfref.numerics.parabolic import texel_centres
-from btfref.representations.factored import Representation
-from btfref.representations.factored_fit import (
+from btfref.numerics.solvers.factoring import map_operators
+from btfref.numerics.sphere.parabolic import texel_centres
+from btfref.representations.factored.definition import Representation
+from btfref.representations.factored.fit import (
     Factors,
     checked_map_size,
     checked_ranges,
     factorized,
     unit_tables,
 )
-from btfref.representations.factored_storage import Storing, fitted
+from btfref.representations.factored.storage import Storing, fitted
 
 __all__ = ["PRESETS", "Representation", "fit"]
 
@@ -42,7 +42,7 @@ SMOOTHNESS = (0.3, 1.0, 3.0, 10.0)
 #: Texels and share of the samples that judge the candidates.
 N_JUDGED, HELD_OUT = 48, 0.2
 
-#: How errors weigh when the scales are fitted; see :func:`btfref.numerics.factoring.sample_weights`.
+#: How errors weigh when the scales are fitted; see :func:`btfref.numerics.solvers.factoring.sample_weights`.
 EXPONENT = 0.75
 
 #: Weight of x̃ = 0 in the normal equations: constants can move between the factors freely, and this picks the smallest.
@@ -169,7 +169,7 @@ def fit(
     smoothness, floor, bounded, map_size
         Of the factorization: see :func:`factorize`.
     clusters, storage, scale_storage, code, rescale, filter_type
-        See :class:`btfref.representations.factored_storage.Storing`.
+        See :class:`btfref.representations.factored.storage.Storing`.
 
     Returns
     -------
@@ -219,7 +219,7 @@ def factorize(
 
     Returns
     -------
-    btfref.representations.factored_fit.Factors
+    btfref.representations.factored.fit.Factors
     """
     map_size = checked_map_size(map_size)
     # Above 0: the least positive floats are in range.

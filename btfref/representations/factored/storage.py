@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics.factoring import TINY, map_operators, sample_weights
-from btfref.numerics.lowrank import range_basis
-from btfref.representations.factored import (
+from btfref.numerics.solvers.factoring import TINY, map_operators, sample_weights
+from btfref.numerics.solvers.lowrank import range_basis
+from btfref.representations.factored.definition import (
     FACTORS,
     Representation,
     batch_last,
@@ -17,7 +17,7 @@ from btfref.representations.factored import (
     index_slots,
     texel_parts,
 )
-from btfref.representations.factored_fit import Steps, unit_tables
+from btfref.representations.factored.fit import Steps, unit_tables
 from btfref.representations.lookup import base_meta, direction_arrays, stored
 
 #: Storage of the maps: floats, halves, or 8-bit codes of [0, 1].
@@ -178,7 +178,7 @@ class Codebooks:
 
     Attributes
     ----------
-    factors : btfref.representations.factored_fit.Factors
+    factors : btfref.representations.factored.fit.Factors
     prototypes : dict of str to ndarray of float32, shape (prototype, n, n, 3)
         In [0, 1], each channel with a peak of 1.
     labels : dict of str to ndarray of int, shape (texel, term)
@@ -198,7 +198,7 @@ def cluster(factors, clusters, *, seed=0, step=lambda label: None):
 
     Parameters
     ----------
-    factors : btfref.representations.factored_fit.Factors
+    factors : btfref.representations.factored.fit.Factors
     clusters : int or None
         Largest codebook of each factor; None: no clustering.
     seed : int

@@ -1,8 +1,9 @@
 """Representations as multi-part OpenEXR files: one part per map, the manifest as an attribute.
 
-How a map stands as an image: :mod:`btfref.representations.map_images`. The manifest (JSON, attribute ``btfref`` of the
-first part) keeps shapes and types, so that the maps come back exactly. OpenEXR has no 8-bit channels: uint8 maps, whose
-value is code / 255, stand in the file as half floats of that value, which viewers show and which round back to it.
+How a map stands as an image: :mod:`btfref.representations.file.map_images`. The manifest (JSON, attribute ``btfref``
+of the first part) keeps shapes and types, so that the maps come back exactly. OpenEXR has no 8-bit channels: uint8
+maps, whose value is code / 255, stand in the file as half floats of that value, which viewers show and which round
+back to it.
 """
 
 from __future__ import annotations
@@ -17,8 +18,7 @@ import numpy as np
 from btfref.conventions import SCHEMA_VERSION
 from btfref.errors import InputError
 from btfref.registry import method
-from btfref.representations.exr_rows import RowReader
-from btfref.representations.map_images import (
+from btfref.representations.file.map_images import (
     channel_names,
     file_shape,
     image_of,
@@ -26,7 +26,8 @@ from btfref.representations.map_images import (
     leading_axes,
     rows_of,
 )
-from btfref.representations.resident import needed_rows, select
+from btfref.representations.file.resident import needed_rows, select
+from btfref.representations.file.rows import RowReader
 
 ATTRIBUTE = "btfref"
 #: Share of a file's bytes up to which reading its rows one by one is faster than the whole by OpenEXR: the former
@@ -115,7 +116,7 @@ def load(path, *, views=None, lights=None, entries=None, levels=None):
     ----------
     path : path-like
     views, lights : array_like of int, optional
-        Keep the maps of these directions only; see :mod:`btfref.representations.resident`. What is not kept is not
+        Keep the maps of these directions only; see :mod:`btfref.representations.file.resident`. What is not kept is not
         read either where it stands in parts or rows of its own and reading the rest alone is worth it.
     entries, levels : array_like of int, optional
         Keep these entries of codebooks (clusters, materials), and these levels of detail, only.

@@ -2,7 +2,7 @@
 
 A part's channels are the last axis of its map; the other axes fold into the image: trailing axes into columns while
 they fit, the rest into rows. Axes of which scenes need a part (views, clusters: ``ROWS_BY`` of the class) come first,
-as rows, so that those rows can be read alone (:mod:`btfref.representations.exr_rows`); the manifest's ``rows`` lists
+as rows, so that those rows can be read alone (:mod:`btfref.representations.file.rows`); the manifest's ``rows`` lists
 them.
 """
 

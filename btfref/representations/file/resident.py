@@ -19,7 +19,7 @@ from fnmatch import fnmatchcase
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics.interpolation import MISSING
+from btfref.numerics.sphere.interpolation import MISSING
 
 #: Kinds of directions: what their maps' axes are called in a class, and in the meta of a selection.
 KINDS = {"view": "VIEW_AXES", "light": "LIGHT_AXES"}

@@ -6,10 +6,10 @@ import numpy as np
 
 from btfref.conventions import FILTER_TYPES
 from btfref.errors import InputError
-from btfref.numerics.directions import directions
 from btfref.numerics.heightfield import HEIGHT_LIMIT
 from btfref.numerics.microfacets import isotropic_ndf
-from btfref.representations.gbrdf import Representation, field_constants
+from btfref.numerics.sphere.directions import directions
+from btfref.representations.gbrdf.definition import Representation, field_constants
 from btfref.representations.lookup import direction_arrays, meta_for, stored
 
 #: Turns are stored in steps of 1/1530: the fully saturated hues of an 8-bit picture, so that pictures lose nothing.
@@ -58,7 +58,7 @@ def from_maps(
     specular : array_like, shape (m,) or ()
         c_s in [0, 1] of each material; each texel holds it below what conserves energy.
     views, lights
-        Sets of directions that guide importance sampling; see `btfref.numerics.directions.directions`.
+        Sets of directions that guide importance sampling; see `btfref.numerics.sphere.directions.directions`.
     filter_type : {"bilinear", "nearest"}
     storage : {"half", "float"}
         Type of colours and distributions; heights and rotations are float32.

@@ -18,15 +18,15 @@ from typing import ClassVar
 import numpy as np
 
 from btfref import conventions
-from btfref.numerics.frames import surface_frame
-from btfref.numerics.halfway import half_vector
 from btfref.numerics.heightfield import LIFT, HeightField
 from btfref.numerics.microfacets import geometry_factor, schlick, specular_albedo_bound
-from btfref.numerics.parabolic import bilinear_stencil
-from btfref.numerics.precision import computing_in, real
+from btfref.numerics.sphere.frames import surface_frame
+from btfref.numerics.sphere.halfway import half_vector
+from btfref.numerics.sphere.parabolic import bilinear_stencil
+from btfref.precision import computing_in, real
+from btfref.representations.file.resident import Entries, refuse_absent
 from btfref.representations.guide import group_means, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points
-from btfref.representations.resident import Entries, refuse_absent
 
 #: Tiles by which a port's hit may differ from the definition's: float32 positions at the far end of the longest ray.
 HIT_TOLERANCE = 2e-6

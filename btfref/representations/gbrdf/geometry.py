@@ -10,8 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics.directions import directions
 from btfref.numerics.heightfield import HeightField
+from btfref.numerics.sphere.directions import directions
 
 #: Directions at which a part's BSDF is evaluated to find its distribution.
 _DIRECTIONS = "ubo151"
@@ -40,7 +40,7 @@ def from_mesostructure(
 
     Returns
     -------
-    btfref.representations.gbrdf.Representation
+    btfref.representations.gbrdf.definition.Representation
         One material a part. Heights and frames are those under the texels' centres; c_d, r0 and p of each part are
         fitted to its BSDF by the decomposition's last step.
 
@@ -50,7 +50,7 @@ def from_mesostructure(
         Bad parameters, or a surface with holes.
     """
     from btfref.mesostructure import build
-    from btfref.representations.gbrdf_build import from_maps
+    from btfref.representations.gbrdf.build import from_maps
     from btfref.representations.lookup import positive_integer
 
     texels = positive_integer("texels", texels)
@@ -139,7 +139,10 @@ def _seen_from_above(made, texels):
 
 def _material(bsdf, part, uv, ndf_size):
     """Parameters of a part's BSDF: those of a flat BTF made of it, a column of texels."""
-    from btfref.decomposition.reflectance import SurfaceSamples, material_reflectance
+    from btfref.representations.gbrdf.decomposition.reflectance import (
+        SurfaceSamples,
+        material_reflectance,
+    )
 
     textured = bool(part.textures)
     uv = uv if textured and len(uv) else np.full((1, 2), 0.5)

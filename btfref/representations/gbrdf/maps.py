@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics.directions import directions
-from btfref.representations.gbrdf_build import HUE_STEPS, from_maps
+from btfref.numerics.sphere.directions import directions
+from btfref.representations.gbrdf.build import HUE_STEPS, from_maps
 
 SCALARS = "maps.toml"
 
@@ -56,7 +56,7 @@ def export_maps(representation, out):
 
     Parameters
     ----------
-    representation : btfref.representations.gbrdf.Representation
+    representation : btfref.representations.gbrdf.definition.Representation
     out : path-like
         Folder to make.
 
@@ -72,8 +72,8 @@ def export_maps(representation, out):
     """
     from PIL import Image
 
-    from btfref.formats.maps import new_folder
-    from btfref.formats.pictures import write_exr
+    from btfref.images.decoding import write_exr
+    from btfref.outputs import new_folder
 
     maps, meta = representation.maps, representation.meta
     if len(maps["ndf"]) > 256:
@@ -127,7 +127,7 @@ def import_maps(folder):
 
     Returns
     -------
-    btfref.representations.gbrdf.Representation
+    btfref.representations.gbrdf.definition.Representation
 
     Raises
     ------

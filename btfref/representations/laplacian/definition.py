@@ -12,8 +12,8 @@ and is never worse. The preset "paper" has all of it as published.
 
 from __future__ import annotations
 
-from btfref.representations.laplacian_fit import fit
-from btfref.representations.laplacian_levels import Representation
+from btfref.representations.laplacian.fit import fit
+from btfref.representations.laplacian.levels import Representation
 
 __all__ = ["PRESETS", "Representation", "fit"]
 

@@ -1,16 +1,16 @@
-"""Fit of a Laplacian pyramid with principal components per level; see :mod:`btfref.representations.laplacian`."""
+"""Fit of a Laplacian pyramid with principal components per level."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics.lowrank import range_basis, texel_matrix
 from btfref.numerics.phong import fit_phong, phong
 from btfref.numerics.pyramid import expand_image, gaussian_pyramid, level_shapes
+from btfref.numerics.solvers.lowrank import range_basis, texel_matrix
 from btfref.numerics.ycbcr import CHANNELS, FROM_RGB, RGB_METRIC, RGB_WEIGHT
-from btfref.representations.analytic import edge_constants
-from btfref.representations.laplacian_levels import Representation
+from btfref.representations.analytic.light_functions import edge_constants
+from btfref.representations.laplacian.levels import Representation
 from btfref.representations.lookup import base_meta, direction_arrays, stored
 
 #: Numbers of components of Y, Cb and Cr at each level (section 3.3 of the paper).

@@ -1,4 +1,4 @@
-"""The maps of a Laplacian pyramid and their definition; see :mod:`btfref.representations.laplacian`."""
+"""The maps of a Laplacian pyramid and their definition."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 
 from btfref.conventions import texel_stencil
 from btfref.errors import InputError
-from btfref.numerics import interpolation
 from btfref.numerics.phong import phong
-from btfref.numerics.precision import real
 from btfref.numerics.pyramid import clamped_lod, expand_image, level_weights
+from btfref.numerics.sphere import interpolation
 from btfref.numerics.ycbcr import TO_RGB
-from btfref.representations.analytic import held
+from btfref.precision import real
+from btfref.representations.analytic.light_functions import held
 from btfref.representations.guide import N_GROUPS, feature_views, group_means, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points, packed_arrays
 

@@ -13,10 +13,11 @@ from typing import ClassVar
 import numpy as np
 
 from btfref import conventions
-from btfref.numerics.clustering import leading_axes, local_pca
-from btfref.numerics.lowrank import range_basis, refined_basis, texel_matrix
-from btfref.numerics.precision import real
-from btfref.numerics.threads import one_blas_thread
+from btfref.numerics.solvers.clustering import leading_axes, local_pca
+from btfref.numerics.solvers.lowrank import range_basis, refined_basis, texel_matrix
+from btfref.numerics.solvers.threads import one_blas_thread
+from btfref.precision import real
+from btfref.representations.file.resident import Entries, refuse_absent
 from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
     StoredMaps,
@@ -27,7 +28,6 @@ from btfref.representations.lookup import (
     positive_integer,
     stored,
 )
-from btfref.representations.resident import Entries, refuse_absent
 
 #: "paper": the setting of the 2004 paper's timings, 16 clusters with a mean and 4 components, in floats.
 PRESETS = {"paper": {"clusters": 16, "components": 4, "storage": "float"}}

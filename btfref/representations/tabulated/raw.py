@@ -8,7 +8,8 @@ import numpy as np
 
 from btfref import conventions
 from btfref.errors import InputError
-from btfref.numerics.precision import real
+from btfref.precision import real
+from btfref.representations.file.resident import slots_name, slots_of
 from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
     StoredMaps,
@@ -17,7 +18,6 @@ from btfref.representations.lookup import (
     evaluate_tabulated,
     meta_for,
 )
-from btfref.representations.resident import slots_name, slots_of
 
 PRESETS = {"paper": {}}
 
@@ -91,7 +91,7 @@ def fit_partial(store, *, filter_type="bilinear"):
 
     Parameters
     ----------
-    store : btfref.sampling.store.BTFStore
+    store : btfref.sampling.store.store.BTFStore
         Filled in part, as by ``btfref synth --for``; views or lights without any sample are left out of the table,
         samples that are missing between others are NaN.
     filter_type : {"bilinear", "nearest"}

@@ -11,8 +11,8 @@ from typing import ClassVar
 import numpy as np
 
 from btfref import conventions
-from btfref.numerics.lowrank import range_basis, texel_matrix
-from btfref.numerics.precision import real
+from btfref.numerics.solvers.lowrank import range_basis, texel_matrix
+from btfref.precision import real
 from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
     StoredMaps,

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from btfref.sampling import path_estimator
-from btfref.sampling.path_estimator import PathEstimator, Piece, strata
+from btfref.sampling.paths import estimator
+from btfref.sampling.paths.estimator import PathEstimator, Piece, strata
 from btfref.sampling.tiled_scene import START, stream_words, uniforms
 
 #: Random streams of a texel with a number of samples of its own: more than anybody asks of one texel.
@@ -62,7 +62,7 @@ class TexelPaths(PathEstimator):
     @property
     def samples_per_pass(self):
         """Pairs of lane and light traced together; a bound on memory, without influence on the result."""
-        buffer = min(self.buffer or path_estimator.SAMPLE_BUFFER, path_estimator.SAMPLE_BUFFER)
+        buffer = min(self.buffer or estimator.SAMPLE_BUFFER, estimator.SAMPLE_BUFFER)
         return max(buffer // 12, 1)
 
     def estimate(self, view, texel, counts=None, stream=()):

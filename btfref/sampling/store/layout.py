@@ -15,7 +15,7 @@ larger than `SHARD`. Inner chunks carry a checksum and are read alone by byte ra
 the values it vouches for, so that a killed run never looks complete. Attributes hold every convention; nothing
 in the store depends on the time or on the number of attempts.
 
-Stores made to a target error have three more arrays, a view a chunk (see `btfref.sampling.adaptive`):
+Stores made to a target error have three more arrays, a view a chunk (see `btfref.sampling.paths.adaptive`):
 
 ======== =================== ======= =============================================================================
 pilot    view, row, column, 3 float32 of two pilots, mean variance of one sample each; their mean value
@@ -117,12 +117,6 @@ def attributes_of(path):
     return attributes
 
 
-def refuse_existing(path):
-    """InputError when the path is taken."""
-    if path.exists() or path.is_symlink():
-        raise InputError("exists already", file=path, expected="a new name (or to overwrite)")
-
-
 def shard_shape(n_lights, texels, tile):
     """Lights, tile rows and tile columns of one shard.
 
@@ -148,7 +142,7 @@ def shard_shape(n_lights, texels, tile):
 
 
 def write_headers(path, views, lights, texels, dtype, variance, tile, attributes, adaptive=False):
-    """Lay out an empty store; arguments as of `btfref.sampling.store.create_store`."""
+    """Lay out an empty store; arguments as of `btfref.sampling.store.store.create_store`."""
     if dtype not in ("float16", "float32"):
         raise InputError("type of the values", field="dtype", got=repr(dtype), expected="float16 or float32")
     import zarr

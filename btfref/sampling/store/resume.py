@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from btfref.errors import InputError
-from btfref.sampling.layout import remove_store
-from btfref.sampling.store import open_store
+from btfref.sampling.store.layout import remove_store
+from btfref.sampling.store.store import open_store
 
 
 def resumable(out, views, lights, attributes, overwrite):

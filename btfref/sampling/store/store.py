@@ -9,17 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics.directions import checked
-from btfref.sampling.adaptive import summary
-from btfref.sampling.layout import (
-    DRAFT,
-    KIND,
-    TILE,
-    attributes_of,
-    check_finite,
-    refuse_existing,
-    write_headers,
-)
+from btfref.numerics.sphere.directions import checked
+from btfref.outputs import refuse_existing
+from btfref.sampling.paths.adaptive import summary
+from btfref.sampling.store.layout import DRAFT, KIND, TILE, attributes_of, check_finite, write_headers
 
 
 def create_store(

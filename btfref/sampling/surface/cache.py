@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.numerics.transfer import to_device
+from btfref.numerics.device_arrays import to_device
 
 #: Of the directions that a vertex looks at, one in so many is traced; the others are looked up.
 SHARE = 8

@@ -30,15 +30,15 @@ from typing import Any
 
 import numpy as np
 
-from btfref.numerics.transfer import in_one_kernel, to_device
-from btfref.sampling.lobes import BroadLobes
-from btfref.sampling.surface_cache import LARGEST, LEAST, VisibilityCache
-from btfref.sampling.surface_gather import gather
-from btfref.sampling.surface_pilot import contrast
-from btfref.sampling.surface_points import Bins, centroids, footprints, sample_points
-from btfref.sampling.surface_texels import TOGETHER, TexelWalks, lanes
-from btfref.sampling.surface_triangles import density, triangles
-from btfref.sampling.surface_walks import Lights, Surface, continue_walks, visibility
+from btfref.numerics.device_arrays import in_one_kernel, to_device
+from btfref.sampling.surface.cache import LARGEST, LEAST, VisibilityCache
+from btfref.sampling.surface.gather import gather
+from btfref.sampling.surface.lobes import BroadLobes
+from btfref.sampling.surface.pilot import contrast
+from btfref.sampling.surface.points import Bins, centroids, footprints, sample_points
+from btfref.sampling.surface.texels import TOGETHER, TexelWalks, lanes
+from btfref.sampling.surface.triangles import density, triangles
+from btfref.sampling.surface.walks import Lights, Surface, continue_walks, visibility
 from btfref.sampling.tiled_scene import START, TiledScene, rotated, stream_keys, uniforms
 
 #: View rays of a half whose other half finds a texel empty.

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.numerics.transfer import in_one_kernel, packed, to_device, unpacked
-from btfref.sampling.surface_points import starts
+from btfref.numerics.device_arrays import in_one_kernel, packed, to_device, unpacked
+from btfref.sampling.surface.points import starts
 
 #: Lights that one lane serves.
 LIGHTS_PER_LANE = 3

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.numerics.transfer import to_device
-from btfref.sampling.surface_points import texel_of
+from btfref.numerics.device_arrays import to_device
+from btfref.sampling.surface.points import texel_of
 
 #: Pairs of directions of the pilot, and the most evaluations of a BSDF at once.
 PAIRS, TOGETHER = 64, 1 << 22

@@ -15,9 +15,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.numerics.transfer import packed, to_device, unpacked
-from btfref.sampling.surface_points import starts
-from btfref.sampling.surface_walks import Surface, connect, continue_walks
+from btfref.numerics.device_arrays import packed, to_device, unpacked
+from btfref.sampling.surface.points import starts
+from btfref.sampling.surface.walks import Surface, connect, continue_walks
 from btfref.sampling.tiled_scene import rotated, stream_keys, uniforms
 
 #: Walks that start together: a bound on memory, without influence on the result.

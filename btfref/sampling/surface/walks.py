@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from btfref.numerics.transfer import in_one_kernel, packed, to_device, unpacked
-from btfref.sampling.path_estimator import ROULETTE_LIMIT, ROULETTE_VERTEX
+from btfref.numerics.device_arrays import in_one_kernel, packed, to_device, unpacked
+from btfref.sampling.paths.estimator import ROULETTE_LIMIT, ROULETTE_VERTEX
 from btfref.sampling.tiled_scene import uniforms
 
 #: Lights that one lane serves where vertices are connected to them.
@@ -45,7 +45,7 @@ class Surface:
 
     @classmethod
     def of_points(cls, points, lobes):
-        """From `btfref.sampling.surface_points.Points`."""
+        """From `btfref.sampling.surface.points.Points`."""
         import mitsuba as mi
 
         ids = np.array([*lobes.ids, 0], np.uint32)  # the absorber's part is −1

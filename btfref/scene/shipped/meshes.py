@@ -1,4 +1,4 @@
-"""The meshes of the shipped scenes; ``python -m btfref.scenes.meshes`` writes them again.
+"""The meshes of the shipped scenes; ``python -m btfref.scene.shipped.meshes`` writes them again.
 
 Each is a smooth surface sampled on a regular grid of its parameters, with exact normals and with texture
 coordinates that are continuous inside the mesh. z is up; textures are placed so that one unit of uv is one

@@ -1,8 +1,8 @@
-// Provides environment_lobe, environment_irradiance: a prefiltered environment, as btfref/render/prefilter.py makes it.
+// Provides environment_lobe, environment_irradiance: a prefiltered environment, as btfref/rendering/environment_light/prefilter.py makes it.
 // Expects environment_maps [2 slices, size, size, 3] and clipped_lobes [rows, heights, 4].
 
-#include "lib/powers.glsl"
-#include "lib/sphere_maps.glsl"
+#include "lib/numbers/powers.glsl"
+#include "lib/light/sphere_maps.glsl"
 
 uniform sampler2DArray environment_maps;
 uniform sampler2DArray clipped_lobes;

@@ -1,7 +1,7 @@
 // Provides environment_lit: radiance under the directional lights that stand for an environment, or for a part of it.
 // Expects the representation's btf_eval and environment_lights [light, 2, 4]: direction towards it, irradiance.
 
-#include "lib/table.glsl"
+#include "lib/lookup/table.glsl"
 
 uniform sampler2DArray environment_lights;
 uniform int environment_first;  // light of this pass, and the one after its last

@@ -1,8 +1,8 @@
 // Provides lafortune_light: Lafortune lobes of a texel under a prefiltered environment, without its chroma.
-// Expects what lib/lafortune.glsl and lib/environment.glsl expect.
+// Expects what lib/numbers/lafortune.glsl and lib/light/environment.glsl expect.
 
-#include "lib/environment.glsl"
-#include "lib/lafortune.glsl"
+#include "lib/light/environment.glsl"
+#include "lib/numbers/lafortune.glsl"
 
 // For a view, a lobe is (t . l)^n times the light's cosine with t = C v by component. The cosine is part of the share.
 vec3 lafortune_light(int texel, float diffuse, vec3 view, mat3 to_world) {

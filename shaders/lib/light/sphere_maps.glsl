@@ -1,7 +1,7 @@
 // Provides sphere_lookup: bilinear lookups in maps over the sphere, pairs of parabolic maps.
-// Expects a table [2 maps, size, size, channels <= 4], as btfref/render/prefilter.py makes it.
+// Expects a table [2 maps, size, size, channels <= 4], as btfref/rendering/environment_light/prefilter.py makes it.
 
-#include "lib/parabolic_maps.glsl"
+#include "lib/lookup/parabolic_maps.glsl"
 
 // The second map of a pair holds the lower hemisphere, mirrored. The unit disc fills all but half a texel of the square
 // at its sides, so that a lookup at the rim finds texels on both sides of it.

@@ -1,7 +1,7 @@
 // Provides btf_environment: filtered light of what is broad, and directional lights for what is small and bright.
-// Expects btf_prefiltered(uv, w_view, to_world) of the method and what lib/environment_lights.glsl expects.
+// Expects btf_prefiltered(uv, w_view, to_world) of the method and what lib/light/environment_lights.glsl expects.
 
-#include "lib/environment_lights.glsl"
+#include "lib/light/environment_lights.glsl"
 
 // to_world takes local directions to world space.
 vec3 btf_environment(vec2 uv, vec3 w_view, mat3 to_world, float lod) {

@@ -1,8 +1,8 @@
 // Provides view_stencil and light_stencil: neighbours of a direction among the measured ones; directions_valid.
 // Expects the samplers view_rings or view_triangles and view_cells, the same for light_, and light_directions; view_slots, light_slots.
 
-#include "lib/rings.glsl"
-#include "lib/triangles.glsl"
+#include "lib/lookup/rings.glsl"
+#include "lib/lookup/triangles.glsl"
 
 #ifdef VIEW_RINGS_DIM0
 uniform sampler2DArray view_rings;

@@ -1,7 +1,7 @@
 // Provides packet_sum: the weighted sum of RGB colours that are stored back to back in RGBA texels.
 // Expects PACKET_COLOURS, the number of colours of a packet; colour j, channel c is float 3j + c.
 
-#include "lib/table.glsl"
+#include "lib/lookup/table.glsl"
 
 // Colours 4g to 4g + 3 of a packet; those beyond its end are not fetched and not meant to be used.
 struct PacketGroup {

@@ -1,8 +1,8 @@
 // Provides raised, parabolic_stencil and parabolic_lookup: bilinear lookups in stacks of parabolic maps of the hemisphere.
-// Expects a table [slice, row, column, channels <= 4]; conventions are those of btfref/numerics/parabolic.py.
+// Expects a table [slice, row, column, channels <= 4]; conventions are those of btfref/numerics/sphere/parabolic.py.
 
-#include "lib/stencil.glsl"
-#include "lib/table.glsl"
+#include "lib/lookup/stencil.glsl"
+#include "lib/lookup/table.glsl"
 
 // Parabolic map of the upper hemisphere (Heidrich and Seidel 1998): (s, t) = (x, y) / (1 + z) for unit vectors, here for
 // vectors of any length. Texel centres of an n x n map are at (i + 1/2) * 2/n - 1, as a texture of (s + 1)/2 has them.

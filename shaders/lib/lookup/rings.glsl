@@ -1,9 +1,9 @@
 // Provides ring_stencil: neighbours of a direction among samples on rings, linear in azimuth and in polar angle.
 // Expects a table with one texel a ring: polar angle, azimuth of the first sample, samples, index of the first.
 
-#include "lib/angles.glsl"
-#include "lib/stencil.glsl"
-#include "lib/table.glsl"
+#include "lib/lookup/angles.glsl"
+#include "lib/lookup/stencil.glsl"
+#include "lib/lookup/table.glsl"
 
 // Samples and weights on one ring: (first, following), (1 - fraction, fraction).
 void ring_neighbours(vec4 ring, Angle azimuth, float share, out ivec2 index, out vec2 weight) {

@@ -1,7 +1,7 @@
 // Provides texel_stencil (texels that a lookup blends: flat indices row * columns + column, weights) and texel_corner.
 // Expects FILTER_BILINEAR (1: the four neighbours, 0: the texel that holds uv).
 
-#include "lib/stencil.glsl"
+#include "lib/lookup/stencil.glsl"
 
 // Integer and fractional part of fraction(u) * n - shift.
 // The product is taken in two halves: 4096 = 2^12, so that for n <= 4096 the first product is exact in 24 bits and

@@ -1,8 +1,8 @@
 // Provides triangle_stencil: barycentric neighbours of a direction on a spherical Delaunay triangulation.
-// Expects triangles of six texels (btfref.numerics.interpolation.TriangleInterpolation) and a map of start cells.
+// Expects triangles of six texels (btfref.numerics.sphere.interpolation.TriangleInterpolation) and a map of start cells.
 
-#include "lib/stencil.glsl"
-#include "lib/table.glsl"
+#include "lib/lookup/stencil.glsl"
+#include "lib/lookup/table.glsl"
 
 const int TRIANGLE_TEXELS = 6;
 

@@ -1,8 +1,8 @@
 // Provides lafortune_value: generalized cosine lobes of a texel, without its chroma.
 // Expects lobes [row, column, 4 N_LOBES], peaks [row, column, N_LOBES], colour [row, column, 4].
 
-#include "lib/powers.glsl"
-#include "lib/table.glsl"
+#include "lib/numbers/powers.glsl"
+#include "lib/lookup/table.glsl"
 
 uniform sampler2DArray lobes;
 uniform sampler2DArray peaks;

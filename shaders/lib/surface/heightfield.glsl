@@ -3,8 +3,8 @@
 
 // Conventions are those of btfref/numerics/heightfield.py. A ray through uv at z = 0 is at uv + z w.xy / w.z; heights
 // stand at texel centres. Parallax occlusion mapping (Tatarchuk 2006) with the search replaced by the patch's quadratic.
-#include "lib/table.glsl"
-#include "lib/texels.glsl"
+#include "lib/lookup/table.glsl"
+#include "lib/lookup/texels.glsl"
 
 uniform sampler2DArray cells;
 

@@ -1,8 +1,8 @@
 // Provides lod_of: level of detail of a surface point, from the pixel's footprint or from the distance; sets the step.
-// Expects lib/triangle_table.glsl's SurfacePoint.
+// Expects lib/surface/triangle_table.glsl's SurfacePoint.
 
-#include "lib/footprint.glsl"
-#include "lib/triangle_table.glsl"
+#include "lib/surface/footprint.glsl"
+#include "lib/surface/triangle_table.glsl"
 
 uniform float lod_angle;    // that a sample subtends in radians; 0 leaves the footprint out
 uniform float lod_unit;     // distance at which the level of detail is 0; 0 leaves the distance out

@@ -1,7 +1,7 @@
 // Provides scene_intersect: the exact point where a ray meets a mesh, given a triangle that it meets or just misses.
-// Expects triangles of eight texels written by btfref.render.realtime: positions, normals, uv, dp/du, neighbours.
+// Expects triangles of eight texels written by btfref.rendering.gl.renderer: positions, normals, uv, dp/du, neighbours.
 
-#include "lib/table.glsl"
+#include "lib/lookup/table.glsl"
 
 const int SCENE_TRIANGLE_TEXELS = 8;
 

@@ -9,14 +9,14 @@ from functools import partial
 import numpy as np
 import pytest
 
-from btfref.compare.tolerances import tolerance
-from btfref.numerics.quadrature import gauss_hemisphere
+from btfref.gates.tolerances import tolerance
+from btfref.numerics.sphere.quadrature import gauss_hemisphere
 from btfref.registry import methods
-from btfref.render.approximate import approximate
-from btfref.render.classes import pixel_classes
-from btfref.render.lighting import Lighting, Prepared
-from btfref.render.realtime import realtime
-from btfref.scenes import scene_file
+from btfref.rendering.environment_light.lighting import Lighting, Prepared
+from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.offline.approximate import approximate
+from btfref.scene.pixel_classes import pixel_classes
+from btfref.scene.shipped import scene_file
 
 SIZE = (20, 20)
 SCENES = ("plane", "sphere", "cloth")

@@ -4,20 +4,20 @@ import numpy as np
 import pytest
 from probes import hemisphere
 
-from btfref.compare import compare
-from btfref.compare.comparison import agreement
-from btfref.compare.tolerances import tolerance
+from btfref.comparison import compare
+from btfref.comparison.comparison import agreement
 from btfref.errors import InputError
-from btfref.numerics.harmonics import values
-from btfref.numerics.quadrature import gauss_hemisphere
-from btfref.render.approximate import approximate
-from btfref.render.classes import pixel_classes
-from btfref.render.environment import constant
-from btfref.render.environments import harmonic_environment, shipped
-from btfref.render.harmonic_light import environment_coefficients
-from btfref.render.lighting import Lighting
-from btfref.render.probe import probe_environment
-from btfref.scenes import scene_file
+from btfref.gates.tolerances import tolerance
+from btfref.numerics.sphere.harmonics import values
+from btfref.numerics.sphere.quadrature import gauss_hemisphere
+from btfref.rendering.environment_light.harmonic_light import environment_coefficients
+from btfref.rendering.environment_light.lighting import Lighting
+from btfref.rendering.gl.probe import probe_environment
+from btfref.rendering.offline.approximate import approximate
+from btfref.scene.environment import constant
+from btfref.scene.environments import harmonic_environment, shipped
+from btfref.scene.pixel_classes import pixel_classes
+from btfref.scene.shipped import scene_file
 
 
 def lookups(rng, n, *, mirrored=True):
@@ -99,7 +99,7 @@ def test_more_bands_are_better_and_windows_cost_sharpness(fits, rng):
 
 
 def test_pictures_equal_float64(need, fits):
-    from btfref.render.realtime import realtime
+    from btfref.rendering.gl.renderer import realtime
 
     need("gl"), need("llvm")
     parameters = {"btf": str(fits.path("lpca")), "lights": "envmap", "environment": "studio"}

@@ -8,25 +8,27 @@ import pytest
 from probes import hemisphere
 
 from btfref.cli import main
-from btfref.compare import compare, save_image
-from btfref.compare.comparison import agreement
-from btfref.compare.tolerances import tolerance
+from btfref.comparison import compare
+from btfref.comparison.comparison import agreement
+from btfref.gates.tolerances import tolerance
+from btfref.images import save_image
 from btfref.platform import shader_directory
 from btfref.registry import image_light, methods
-from btfref.render import composer, gl, lighting
-from btfref.render.approximate import approximate
-from btfref.render.classes import pixel_classes
-from btfref.render.environment import Environment, bright_texel, constant
-from btfref.render.environments import studio
-from btfref.render.image_light import radiance
-from btfref.render.lighting import Lighting
-from btfref.render.probe import probe_environment
-from btfref.render.realtime import realtime
-from btfref.render.reference import render
-from btfref.render.scene import read_scene
+from btfref.rendering.environment_light import lighting
+from btfref.rendering.environment_light.image_light import radiance
+from btfref.rendering.environment_light.lighting import Lighting
+from btfref.rendering.gl import composer, device
+from btfref.rendering.gl.probe import probe_environment
+from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.offline.approximate import approximate
+from btfref.rendering.offline.reference import render
+from btfref.scene.description import read_scene
+from btfref.scene.environment import Environment, bright_texel, constant
+from btfref.scene.environments import studio
+from btfref.scene.pixel_classes import pixel_classes
 
 KEYS = [key for key, row in methods().items() if row.image_light]
-SPHERE = files("btfref.scenes").joinpath("sphere.xml")
+SPHERE = files("btfref.scene.shipped").joinpath("sphere.xml")
 SIZE = (48, 48)
 
 
@@ -117,8 +119,8 @@ def test_injected_faults_are_caught(fits, tables, monkeypatch, rng, tmp_path, na
     rep = fits("rf_lobes")
     environment, own = tables("rf_lobes", rep, sky)
     monkeypatch.setattr(image_light("rf_lobes"), "tables", classmethod(lambda *_: own))
-    shipped = gl.shader_file(rep)
-    monkeypatch.setattr(gl, "shader_file", lambda rep: (shipped[0], [tmp_path, *shipped[1]]))
+    shipped = device.shader_file(rep)
+    monkeypatch.setattr(device, "shader_file", lambda rep: (shipped[0], [tmp_path, *shipped[1]]))
     points, light = lookups(rng), Lighting(environment).prepared(rep)
     found = agreement(
         probe_environment(rep, light, *points), light.radiance(*points), gate="environment.agreement"
@@ -129,7 +131,7 @@ def test_injected_faults_are_caught(fits, tables, monkeypatch, rng, tmp_path, na
 @pytest.mark.parametrize("key", KEYS)
 def test_a_constant_environment_is_the_albedo(fits, tables, rng, key):
     """The share of a lobe above the horizon is exact there: the integral of B over the hemisphere comes out."""
-    from btfref.numerics.quadrature import gauss_hemisphere
+    from btfref.numerics.sphere.quadrature import gauss_hemisphere
 
     rep = fits(key)
     _, own = tables(key, rep, "constant")
@@ -246,8 +248,8 @@ def test_glslang_accepts_the_environment_shaders(need, fits, tmp_path, key, targ
         ("hosts/mesh.frag", 2),
         ("hosts/probe_environment.vert", 0),
     ):
-        defines = {**gl.shader_defines(rep), **gl.light_defines(own), "N_LIGHTS": n_lights}
-        shader, directories = gl.shader_file(rep)
+        defines = {**device.shader_defines(rep), **device.light_defines(own), "N_LIGHTS": n_lights}
+        shader, directories = device.shader_file(rep)
         settings = {"representation": shader, "environment": light.SHADER, "directories": directories}
         source = composer.compose(host, defines, target=target, **settings)
         path = tmp_path / host.replace("/", "_")

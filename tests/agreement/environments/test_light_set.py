@@ -3,17 +3,18 @@
 import numpy as np
 import pytest
 
-from btfref.compare import compare, save_image
-from btfref.compare.comparison import agreement
-from btfref.compare.tolerances import tolerance
+from btfref.comparison import compare
+from btfref.comparison.comparison import agreement
 from btfref.errors import InputError
+from btfref.gates.tolerances import tolerance
+from btfref.images import save_image
 from btfref.registry import methods
-from btfref.render.approximate import approximate
-from btfref.render.classes import pixel_classes
-from btfref.render.environment import Environment, bright_texel, constant
-from btfref.render.light_set import TARGET, light_set
-from btfref.render.lighting import Lighting
-from btfref.scenes import scene_file
+from btfref.rendering.environment_light.light_set import TARGET, light_set
+from btfref.rendering.environment_light.lighting import Lighting
+from btfref.rendering.offline.approximate import approximate
+from btfref.scene.environment import Environment, bright_texel, constant
+from btfref.scene.pixel_classes import pixel_classes
+from btfref.scene.shipped import scene_file
 
 SIZE = (32, 32)
 
@@ -68,7 +69,7 @@ def test_black_and_wrong_numbers():
 @pytest.mark.parametrize("key", list(methods()))
 def test_pictures_equal_float64(need, fits, tmp_path, key):
     """The generic path of every method: GLSL against NumPy at the same rays, both sides of a cloth."""
-    from btfref.render.realtime import realtime
+    from btfref.rendering.gl.renderer import realtime
 
     need("gl"), need("llvm")
     save_image(tmp_path / "sky.exr", half_sky().radiance)
@@ -87,7 +88,7 @@ def test_pictures_equal_float64(need, fits, tmp_path, key):
 
 def test_thousands_of_lights_are_all_drawn(need, fits):
     """A software rasterizer ends long loops without a word: lights are drawn in passes, and none is lost."""
-    from btfref.render.realtime import realtime
+    from btfref.rendering.gl.renderer import realtime
 
     need("gl"), need("llvm")
     parameters = {"btf": str(fits.path("lpca")), "lights": "constant"}
@@ -102,7 +103,7 @@ def test_thousands_of_lights_are_all_drawn(need, fits):
 @pytest.mark.parametrize("key", list(methods()))
 def test_a_constant_environment_is_the_albedo(fits, rng, key):
     """With as many lights as 1e-3 asks for: the integral of B over the hemisphere, by any frame."""
-    from btfref.numerics.quadrature import gauss_hemisphere
+    from btfref.numerics.sphere.quadrature import gauss_hemisphere
 
     rep, n = fits(key), 8
     light = Lighting(constant(), "lights", lights=4096).prepared(rep)

@@ -5,22 +5,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from btfref.compare import compare
-from btfref.compare.tolerances import tolerance
+from btfref.comparison import compare
 from btfref.errors import InputError
-from btfref.numerics import harmonics
-from btfref.numerics.quadrature import gauss_hemisphere
-from btfref.render import transfer_light
-from btfref.render.approximate import approximate
-from btfref.render.classes import pixel_classes
-from btfref.render.environments import harmonic_environment
-from btfref.render.lighting import lighting_of
-from btfref.render.realtime import Renderer, realtime
-from btfref.render.reference import render
-from btfref.render.scene import Light, read_scene
-from btfref.render.shapes import neighbours
-from btfref.render.transfer import TransferSettings, clustered, corner_matrices, vertex_transfer
-from btfref.scenes import scene_file
+from btfref.gates.tolerances import tolerance
+from btfref.numerics.sphere import harmonics
+from btfref.numerics.sphere.quadrature import gauss_hemisphere
+from btfref.rendering.environment_light import transfer_light
+from btfref.rendering.environment_light.lighting import lighting_of
+from btfref.rendering.environment_light.transfer import (
+    TransferSettings,
+    clustered,
+    corner_matrices,
+    vertex_transfer,
+)
+from btfref.rendering.gl.renderer import Renderer, realtime
+from btfref.rendering.offline.approximate import approximate
+from btfref.rendering.offline.reference import render
+from btfref.scene.description import Light, read_scene
+from btfref.scene.environments import harmonic_environment
+from btfref.scene.pixel_classes import pixel_classes
+from btfref.scene.shapes import neighbours
+from btfref.scene.shipped import scene_file
 
 SIZE = (32, 32)
 

@@ -9,7 +9,7 @@ from btfref.bench import metrics, subjects, tables
 from btfref.bench.matrix import run
 from btfref.bench.plan import Entry, read_plan, shipped
 from btfref.cli import main
-from btfref.compare.metrics import rmse
+from btfref.comparison.metrics import rmse
 from btfref.errors import InputError
 from btfref.registry import methods
 

@@ -3,7 +3,7 @@
 import pytest
 from oracle import oracle_btf
 
-from btfref.bench import env
+from btfref.bench.experiments import env
 
 
 def test_transfer_table_and_plot(need, tmp_path):

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from btfref.cli import main
-from btfref.compare import save_image
-from btfref.numerics.directions import directions
-from btfref.representations import raw
-from btfref.representations.container import load, save
+from btfref.images import save_image
+from btfref.numerics.sphere.directions import directions
+from btfref.representations.file.container import load, save
+from btfref.representations.tabulated import raw
 from btfref.sampling import SampledBTF
 
 SENTINEL = b"precious"

@@ -15,11 +15,11 @@ import pytest
 from btfref.cli import build_parser, main
 from btfref.commands import COMMANDS, _shared
 from btfref.commands.fit import fit_parameters
-from btfref.compare import tolerance
 from btfref.errors import BtfrefError, InputError, MissingDependencyError
-from btfref.numerics.directions import directions
+from btfref.gates import tolerance
+from btfref.numerics.sphere.directions import directions
+from btfref.provenance import __version__, versions
 from btfref.registry import method
-from btfref.versions import __version__, versions
 
 HEAVY = (
     "mitsuba",
@@ -312,7 +312,7 @@ def test_info_reads_headers_only(store, tmp_path, monkeypatch, capsys):
 
 
 def test_compare_prints_gates_and_decides(tmp_path, capsys):
-    from btfref.compare import save_image
+    from btfref.images import save_image
 
     rng = np.random.default_rng(3)
     image = rng.random((16, 16, 3)).astype(np.float32) + 0.1
@@ -333,7 +333,7 @@ def test_compare_prints_gates_and_decides(tmp_path, capsys):
 
 
 def test_info_of_images(tmp_path, capsys):
-    from btfref.compare import save_image
+    from btfref.images import save_image
 
     for suffix in (".exr", ".png"):
         save_image(tmp_path / f"x{suffix}", np.ones((3, 5, 3)))
@@ -345,7 +345,7 @@ def test_info_of_images(tmp_path, capsys):
 
 def readme_commands():
     """The command lines that the README and the pages of the documentation show."""
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     texts = [path.read_text() for path in (root / "README.md", *sorted((root / "btfref/docs").glob("*.md")))]
     return re.findall(r"^btfref .*$", "\n".join(texts), re.MULTILINE)
 

@@ -9,8 +9,8 @@ import pytest
 from btfref import doctor, platform, system
 from btfref.cli import main
 from btfref.commands.doctor import lines
-from btfref.compare import tolerance
 from btfref.errors import MissingDependencyError
+from btfref.gates import tolerance
 
 
 @pytest.fixture(scope="module")

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from btfref.doctor import PINNED
-from btfref.versions import RELEVANT, __version__
+from btfref.provenance import RELEVANT, __version__
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 

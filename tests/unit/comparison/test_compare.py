@@ -10,21 +10,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from btfref.compare import (
-    Comparison,
-    Display,
-    agreement,
-    compare,
-    gate_table,
-    judge,
-    missing_reference,
-    reason,
-    tolerance,
-)
-from btfref.compare.tolerances import gate_keys, limits, parse
+from btfref.comparison import Comparison, Display, agreement, compare
 from btfref.errors import InputError
+from btfref.gates import gate_table, judge, missing_reference, reason, tolerance
+from btfref.gates.tolerances import gate_keys, limits, parse
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 INTERIOR, SILHOUETTE = 1, 2
 
 
@@ -332,7 +323,7 @@ def test_requirements_are_skipped_or_demanded(need, capabilities, monkeypatch, w
 
 
 def test_import_is_light():
-    code = "import sys, btfref.compare, btfref.report; print(*sys.modules)"
+    code = "import sys, btfref.comparison, btfref.report; print(*sys.modules)"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     heavy = {
         "mitsuba",

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
-from btfref.compare import Display, load_image, save_image, tolerance
+from btfref.comparison import Display
 from btfref.errors import InputError
+from btfref.gates import tolerance
+from btfref.images import load_image, save_image
 
 
 @pytest.fixture
@@ -94,7 +96,7 @@ def test_a_failing_write_leaves_the_old_file(tmp_path, picture, monkeypatch):
     def fail(pixels):
         raise MemoryError
 
-    monkeypatch.setattr("btfref.compare.png.encode_png", fail)
+    monkeypatch.setattr("btfref.images.png.encode_png", fail)
     with pytest.raises(MemoryError):
         save_image(path, picture * 2)
     assert path.read_bytes() == before

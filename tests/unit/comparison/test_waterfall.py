@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from btfref.compare.colour import Display
-from btfref.compare.parts import part
-from btfref.compare.tolerances import tolerance
-from btfref.compare.waterfall import Picture, waterfall
+from btfref.comparison.parts import part
+from btfref.comparison.waterfall import Picture, waterfall
 from btfref.errors import InputError
+from btfref.gates.tolerances import tolerance
+from btfref.images.display import Display
 
 SHAPE = (40, 50, 3)
 MASK = np.ones(SHAPE[:2], bool)

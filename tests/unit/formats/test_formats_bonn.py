@@ -6,11 +6,11 @@ import formats_material as material
 import numpy as np
 import pytest
 
-from btfref.compare import tolerance
 from btfref.errors import InputError
 from btfref.formats import export_btf, identify, import_btf, open_source
-from btfref.numerics.directions import directions
-from btfref.numerics.lowrank import texel_matrix
+from btfref.gates import tolerance
+from btfref.numerics.solvers.lowrank import texel_matrix
+from btfref.numerics.sphere.directions import directions
 from btfref.sampling import SampledBTF
 
 FLOAT = "formats.float_factors"

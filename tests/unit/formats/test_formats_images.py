@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from btfref.compare import tolerance
 from btfref.errors import InputError
-from btfref.formats import export_btf, identify, import_btf, open_source, pictures, radiance
-from btfref.formats.angles import angles_of, grid
+from btfref.formats import export_btf, identify, import_btf, open_source
+from btfref.formats.image_sets.angles import angles_of, grid
+from btfref.gates import tolerance
+from btfref.images import decoding, radiance
 from btfref.numerics.colour import RGB_TO_XYZ, decode_srgb
-from btfref.numerics.directions import DirectionSet, directions, spherical
+from btfref.numerics.sphere.directions import DirectionSet, directions, spherical
 from btfref.sampling import SampledBTF
 
 ANGLES = material.ANGLES
@@ -62,7 +63,7 @@ def archive(path, source):
 def exr(planes):
     def make(colours):
         with tempfile.NamedTemporaryFile(suffix=".exr") as stream:
-            pictures.write_exr(planes(colours), stream.name)
+            decoding.write_exr(planes(colours), stream.name)
             return stream.read()
 
     return make

@@ -12,7 +12,7 @@ from btfref.cli import main
 from btfref.errors import InputError
 from btfref.formats import FORMATS, format_named, identify, import_btf, merl, names, open_source
 from btfref.formats.convert import import_btf as convert
-from btfref.numerics.directions import directions
+from btfref.numerics.sphere.directions import directions
 from btfref.sampling import SampledBTF, open_store
 
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from probes import hemisphere
 
-from btfref.compare.tolerances import tolerance
 from btfref.errors import InputError
-from btfref.numerics.directions import DirectionSet, directions, spherical
-from btfref.numerics.frames import shading_frame
-from btfref.numerics.interpolation import from_arrays
-from btfref.numerics.parabolic import hemisphere_to_square, solid_angle_density, square_to_hemisphere
-from btfref.numerics.quadrature import gauss_hemisphere
+from btfref.gates.tolerances import tolerance
+from btfref.numerics.sphere.directions import DirectionSet, directions, spherical
+from btfref.numerics.sphere.frames import shading_frame
+from btfref.numerics.sphere.interpolation import from_arrays
+from btfref.numerics.sphere.parabolic import hemisphere_to_square, solid_angle_density, square_to_hemisphere
+from btfref.numerics.sphere.quadrature import gauss_hemisphere
 
 NAMES = ("ubo81", "ubo151", "10x5", "16x8", "scattered")
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from btfref.compare.tolerances import tolerance
 from btfref.errors import InputError
-from btfref.numerics import harmonics
-from btfref.numerics.directions import directions
-from btfref.numerics.quadrature import gauss_hemisphere
+from btfref.gates.tolerances import tolerance
+from btfref.numerics.sphere import harmonics
+from btfref.numerics.sphere.directions import directions
+from btfref.numerics.sphere.quadrature import gauss_hemisphere
 
 EXACT = tolerance("harmonics.exact")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from probes import hemisphere
 
-from btfref.compare.tolerances import tolerance
+from btfref.gates.tolerances import tolerance
 from btfref.numerics.heightfield import MAXIMUM_TRAVEL, HeightField, first_root
 
 EXACT = tolerance("interpolation.exact.max")

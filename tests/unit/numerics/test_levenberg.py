@@ -5,11 +5,11 @@ import types
 import numpy as np
 import pytest
 
-from btfref.compare.tolerances import tolerance
-from btfref.numerics.directions import directions
-from btfref.numerics.levenberg import backend, fit_batch
-from btfref.representations.lafortune import lafortune_model
-from btfref.representations.rf_lobes import fit_lobes, lobe_model
+from btfref.gates.tolerances import tolerance
+from btfref.numerics.solvers.levenberg import backend, fit_batch
+from btfref.numerics.sphere.directions import directions
+from btfref.representations.analytic.lafortune import lafortune_model
+from btfref.representations.analytic.rf_lobes import fit_lobes, lobe_model
 from btfref.stress.data import bumpy_values
 
 
@@ -126,7 +126,7 @@ def test_jacobians_are_those_of_differences(module, rng, model):
 def test_lobes_are_no_worse_than_scipy_s(module):
     from scipy.optimize import least_squares
 
-    from btfref.representations.lobe_start import exponent_limit, lobe_starts
+    from btfref.representations.analytic.lobe_start import exponent_limit, lobe_starts
 
     lights = directions("ubo81")
     data = bumpy_values((6, 5), lights, lights)[20].mean(-1).reshape(81, -1).T.astype(np.float32)

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from btfref.compare.tolerances import tolerance
 from btfref.errors import InputError
+from btfref.gates.tolerances import tolerance
 from btfref.numerics import footprint, pyramid
-from btfref.numerics.directions import directions
 from btfref.numerics.phong import fit_phong, phong
+from btfref.numerics.sphere.directions import directions
 from btfref.numerics.ycbcr import FROM_RGB, RGB_METRIC, TO_RGB
 
 SHAPES = [(64, 64), (16, 12), (13, 7), (1, 5), (1, 1)]

@@ -7,7 +7,7 @@ import pytest
 
 from btfref.errors import InputError
 from btfref.platform import shader_directory
-from btfref.render.composer import TARGETS, compose, define_block, representation_defines
+from btfref.rendering.gl.composer import TARGETS, compose, define_block, representation_defines
 
 
 @pytest.fixture
@@ -65,10 +65,10 @@ def test_nested_includes_once_with_line_numbers(shaders):
     [
         ('#include "nowhere.glsl"', "unknown shader file"),
         ('#include "../outside.glsl"', "unknown shader file"),
-        ("#include <lib/table.glsl>", "malformed include"),
+        ("#include <lib/lookup/table.glsl>", "malformed include"),
         ("#include", "malformed include"),
-        ('#if 1\n#include "lib/table.glsl"\n#endif', "inside a conditional"),
-        ('#ifdef X\n#ifndef Y\n#endif\n #include "lib/table.glsl"\n#endif', "inside a conditional"),
+        ('#if 1\n#include "lib/lookup/table.glsl"\n#endif', "inside a conditional"),
+        ('#ifdef X\n#ifndef Y\n#endif\n #include "lib/lookup/table.glsl"\n#endif', "inside a conditional"),
         ("#version 330", "version line"),
         ('#include "bad.glsl"', "includes itself"),
         ('#include "representation"', "no representation"),
@@ -82,7 +82,9 @@ def test_refusals_name_file_and_line(shaders, text, reason):
 
 
 def test_own_directory_comes_first_and_representation_is_replaced(shaders):
-    directories = shaders({"lib/table.glsl": "int mine;", "foo.glsl": '#include "lib/table.glsl"\nint foo;'})
+    directories = shaders(
+        {"lib/lookup/table.glsl": "int mine;", "foo.glsl": '#include "lib/lookup/table.glsl"\nint foo;'}
+    )
     source = compose("hosts/probe.vert", representation="foo.glsl", directories=directories)
     assert "int mine;" in source
     assert "int foo;" in source

@@ -7,8 +7,8 @@ import pytest
 from oracle import oracle_btf
 from probes import hemisphere, probe_points
 
-from btfref.compare.tolerances import tolerance
 from btfref.errors import InputError
+from btfref.gates.tolerances import tolerance
 from btfref.registry import method, methods
 from btfref.representations import load, save
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from btfref.render.environment import Environment, bright_texel, cell_angles, constant
-from btfref.render.environments import studio
-from btfref.render.split_light import MOST, TARGET, split_light
+from btfref.rendering.environment_light.split_light import MOST, TARGET, split_light
+from btfref.scene.environment import Environment, bright_texel, cell_angles, constant
+from btfref.scene.environments import studio
 
 #: Cosine of the outermost ring of the usual 81 directions.
 EDGE = np.cos(np.radians(75))

@@ -6,9 +6,9 @@ from PIL import Image
 
 from btfref.cli import main
 from btfref.errors import InputError
-from btfref.numerics.directions import directions
+from btfref.numerics.sphere.directions import directions
 from btfref.report.btf_plot import _image, _spread, hemisphere, plot_btf
-from btfref.sampling.store import create_store
+from btfref.sampling.store.store import create_store
 
 VIEWS, LIGHTS = directions("3x4"), directions("ubo81")
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from browser import browse
 
-from btfref.compare import GateResult, compare, missing_reference, reason, tolerance
-from btfref.compare.png import encode_png
+from btfref.comparison import compare
 from btfref.errors import InputError
+from btfref.gates import GateResult, missing_reference, reason, tolerance
+from btfref.images.png import encode_png
 from btfref.report import Cell, report_data, write_report
 from btfref.report.pack import pack, unpack
 from btfref.report.text import number
@@ -291,7 +292,7 @@ def test_page_works_in_a_browser(tmp_path, cells, need, width):
     assert [float(text) for text in shown] == pytest.approx(expected, rel=tolerance("report.readout.rtol"))
     assert found["split"] == "25%"
     display = cells[0].comparison.settings["display"]["stops"]
-    from btfref.compare import Display
+    from btfref.comparison import Display
 
     encoded = 255 * Display(display).encoded(expected)
     assert found["colour"][:3] == pytest.approx(encoded, abs=tolerance("report.colour.steps"))

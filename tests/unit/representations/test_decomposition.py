@@ -3,16 +3,21 @@
 import numpy as np
 import pytest
 
-from btfref.compare.tolerances import tolerance
-from btfref.decomposition import heights, materials, normals, reflectance
-from btfref.decomposition.pairs import ReciprocalPairs, shifted, surface_stencil, tangent
-from btfref.decomposition.pipeline import fit
 from btfref.errors import InputError
-from btfref.numerics.directions import directions
+from btfref.gates.tolerances import tolerance
 from btfref.numerics.heightfield import HeightField
 from btfref.numerics.microfacets import isotropic_ndf
-from btfref.numerics.parabolic import texel_directions
-from btfref.representations.gbrdf_build import from_maps
+from btfref.numerics.sphere.directions import directions
+from btfref.numerics.sphere.parabolic import texel_directions
+from btfref.representations.gbrdf.build import from_maps
+from btfref.representations.gbrdf.decomposition import heights, materials, normals, reflectance
+from btfref.representations.gbrdf.decomposition.pairs import (
+    ReciprocalPairs,
+    shifted,
+    surface_stencil,
+    tangent,
+)
+from btfref.representations.gbrdf.decomposition.pipeline import fit
 from btfref.sampling import SampledBTF
 
 EXACT = tolerance("interpolation.exact.max")
@@ -287,7 +292,7 @@ def test_geometry_becomes_a_g_brdf(need):
     """Without fitting: heights, normals and materials of the checker."""
     need("llvm")
     from btfref.mesostructure.checker import checker_height
-    from btfref.representations.gbrdf_geometry import from_mesostructure
+    from btfref.representations.gbrdf.geometry import from_mesostructure
 
     rep = from_mesostructure("checker", texels=16)
     x = (np.arange(16) + 0.5) / 16

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from oracle import oracle_btf
 
-from btfref.compare.tolerances import tolerance
 from btfref.errors import InputError
-from btfref.numerics import factoring, halfway, parabolic
-from btfref.numerics.directions import directions
+from btfref.gates.tolerances import tolerance
+from btfref.numerics.solvers import factoring
+from btfref.numerics.sphere import halfway, parabolic
+from btfref.numerics.sphere.directions import directions
 from btfref.registry import methods
-from btfref.representations import cmf, factored_fit, hf
+from btfref.representations.factored import cmf, hf
+from btfref.representations.factored import fit as factored_fit
 from btfref.sampling import SampledBTF
 
 KEYS = ("cmf", "hf")

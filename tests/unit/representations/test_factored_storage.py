@@ -7,11 +7,13 @@ import pytest
 from oracle import oracle_btf
 from probes import hemisphere
 
-from btfref.compare.tolerances import tolerance
-from btfref.numerics.directions import directions
+from btfref.gates.tolerances import tolerance
+from btfref.numerics.sphere.directions import directions
 from btfref.registry import methods
-from btfref.representations import cmf, factored_storage, load, read_info, save
-from btfref.representations.factored import decoded
+from btfref.representations import load, read_info, save
+from btfref.representations.factored import cmf
+from btfref.representations.factored import storage as factored_storage
+from btfref.representations.factored.definition import decoded
 
 KEYS = ("cmf", "hf")
 

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from probes import hemisphere, hit_allowance, probe_points
 
-from btfref.compare.tolerances import tolerance
 from btfref.errors import InputError
-from btfref.numerics.directions import directions
+from btfref.gates.tolerances import tolerance
 from btfref.numerics.microfacets import geometry_factor, isotropic_ndf, schlick
-from btfref.numerics.parabolic import texel_directions, texel_solid_angles
-from btfref.numerics.quadrature import gauss_hemisphere
+from btfref.numerics.sphere.directions import directions
+from btfref.numerics.sphere.parabolic import texel_directions, texel_solid_angles
+from btfref.numerics.sphere.quadrature import gauss_hemisphere
 from btfref.representations import load, save
-from btfref.representations.gbrdf_build import HUE_STEPS, from_maps, from_photograph
-from btfref.representations.gbrdf_maps import export_maps, hue_of_turns, import_maps, turns_of_hue
+from btfref.representations.gbrdf.build import HUE_STEPS, from_maps, from_photograph
+from btfref.representations.gbrdf.maps import export_maps, hue_of_turns, import_maps, turns_of_hue
 
 EXACT = tolerance("interpolation.exact.max")
 
@@ -158,8 +158,8 @@ def test_extremes_agree(name, rng, need, llvm, tmp_path):
     import drjit as dr
 
     import mitsuba_plugins
-    from btfref.compare.comparison import agreement
-    from btfref.render.probe import probe
+    from btfref.comparison.comparison import agreement
+    from btfref.rendering.gl.probe import probe
 
     need("gl")
     mi = llvm
@@ -189,7 +189,7 @@ def test_few_lookups_are_at_an_edge(fits):
 
 def test_a_march_that_stops_early_is_caught(rng):
     """The allowance does not hide a wrong hit: heights 1 % deeper fail the gate."""
-    from btfref.compare.comparison import agreement
+    from btfref.comparison.comparison import agreement
 
     rep = edited(rng)
     wrong = type(rep).from_arrays(

@@ -8,11 +8,12 @@ import pytest
 from oracle import SHAPE, oracle_btf
 
 from btfref.cli import main
-from btfref.compare.tolerances import tolerance
 from btfref.errors import InputError
+from btfref.gates.tolerances import tolerance
 from btfref.numerics import pyramid
-from btfref.representations import laplacian, read_info, save
-from btfref.representations.laplacian_fit import packed_layout
+from btfref.representations import read_info, save
+from btfref.representations.laplacian import definition as laplacian
+from btfref.representations.laplacian.fit import packed_layout
 
 
 @pytest.fixture(scope="module")

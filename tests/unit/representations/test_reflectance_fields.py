@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from oracle import oracle_btf
 
-from btfref.compare.tolerances import tolerance
 from btfref.errors import InputError
-from btfref.numerics.directions import directions
+from btfref.gates.tolerances import tolerance
+from btfref.numerics.sphere.directions import directions
 from btfref.registry import method
 from btfref.representations import load, save
-from btfref.representations.rf_lobes import lobe_sum
-from btfref.representations.rf_poly import light_operator, terms
+from btfref.representations.analytic.rf_lobes import lobe_sum
+from btfref.representations.analytic.rf_poly import light_operator, terms
 from btfref.sampling import SampledBTF
 
 METHODS = ("rf_poly", "rf_lobes", "lafortune", "lafortune_lut")
@@ -121,7 +121,7 @@ def test_any_stored_parameters_are_finite_everywhere(need, llvm, key, tmp_path, 
     import drjit as dr
 
     import mitsuba_plugins
-    from btfref.render.probe import probe
+    from btfref.rendering.gl.probe import probe
 
     need("gl")
     fitted = method(key).fit(oracle_btf((4, 4)))
@@ -153,8 +153,8 @@ def test_any_stored_parameters_are_finite_everywhere(need, llvm, key, tmp_path, 
 def test_other_numbers_of_lobes(need, rng, lobes):
     need("llvm")
     need("gl")
-    from btfref.compare import agreement
-    from btfref.render.probe import probe
+    from btfref.comparison import agreement
+    from btfref.rendering.gl.probe import probe
 
     btf = oracle_btf((4, 4))
     w = rng.normal(size=(2, 4000, 3))

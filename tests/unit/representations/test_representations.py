@@ -8,14 +8,14 @@ import pytest
 from oracle import oracle_btf
 from probes import probe_points
 
-from btfref.compare.tolerances import tolerance
 from btfref.conventions import texel_stencil
 from btfref.errors import InputError
-from btfref.numerics.clustering import local_pca
-from btfref.numerics.lowrank import range_basis, refined_basis, texel_matrix
+from btfref.gates.tolerances import tolerance
+from btfref.numerics.solvers.clustering import local_pca
+from btfref.numerics.solvers.lowrank import range_basis, refined_basis, texel_matrix
 from btfref.registry import method, methods
 from btfref.representations import load, read_info, save
-from btfref.representations.container import payload_bytes
+from btfref.representations.file.container import payload_bytes
 
 
 @pytest.fixture(scope="module")

@@ -61,7 +61,7 @@ def test_checker_height_is_periodic_and_smooth():
     numeric = (checker_height(x + step, y, **options)[0] - checker_height(x - step, y, **options)[0]) / (
         2 * step
     )
-    from btfref.compare.tolerances import tolerance
+    from btfref.gates.tolerances import tolerance
 
     assert np.abs(numeric - slope_x).max() <= tolerance("mesostructure.slope")
     numeric = (checker_height(x, y + step, **options)[0] - checker_height(x, y - step, **options)[0]) / (

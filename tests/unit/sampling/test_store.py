@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from btfref.errors import InputError
-from btfref.numerics.directions import directions
+from btfref.numerics.sphere.directions import directions
 from btfref.sampling import SampledBTF, open_store
-from btfref.sampling.layout import remove_leftovers
-from btfref.sampling.store import BTFStore, create_store
+from btfref.sampling.store.layout import remove_leftovers
+from btfref.sampling.store.store import BTFStore, create_store
 
 VIEWS, LIGHTS = directions("2x3"), directions("2x4")
 

@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 
 from btfref.cli import main
-from btfref.compare.tolerances import tolerance
 from btfref.errors import InputError
+from btfref.gates.tolerances import tolerance
 from btfref.mesostructure import build
 from btfref.mesostructure.materials import bsdf_from_xml, load_bsdf
 from btfref.mesostructure.seams import mesh_seams, open_edges
@@ -338,7 +338,7 @@ def test_the_command_line_takes_files(tmp_path, llvm, capsys):
 
 
 def test_geometry_truth_of_a_file_that_changed_is_refused(tmp_path, llvm):
-    from btfref.render.geometry import _built
+    from btfref.rendering.offline.geometry import _built
     from btfref.sampling import open_store
     from btfref.sampling.synthesis import synthesize_store
 

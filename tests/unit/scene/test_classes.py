@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from btfref.render.classes import INTERIOR, SILHOUETTE, pixel_classes
+from btfref.scene.pixel_classes import INTERIOR, SILHOUETTE, pixel_classes
 
 #: A square in two triangles, larger than the picture; its diagonal runs through the picture's corners.
 CORNERS = ((-2, -2), (2, -2), (2, 2), (-2, 2))

@@ -7,17 +7,18 @@ import numpy as np
 import pytest
 
 from btfref.cli import main
-from btfref.compare.tolerances import tolerance
-from btfref.demand import MARGIN, Demand, demand, maps_needed
 from btfref.errors import BtfrefError, InputError
-from btfref.numerics.directions import directions, spherical
-from btfref.render.realtime import realtime
-from btfref.render.reference import render
-from btfref.representations import load, raw, save
+from btfref.gates.tolerances import tolerance
+from btfref.numerics.sphere.directions import directions, spherical
+from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.offline.reference import render
+from btfref.representations import load, save
+from btfref.representations.tabulated import raw
 from btfref.sampling import SampledBTF, open_store
-from btfref.sampling.part import Part
+from btfref.sampling.store.part import Part
 from btfref.sampling.synthesis import synthesize_store
-from btfref.scenes import scene_file
+from btfref.scene.demand import MARGIN, Demand, demand, maps_needed
+from btfref.scene.shipped import scene_file
 
 SIZE = (40, 40)
 PLANE = scene_file("plane")
@@ -35,7 +36,7 @@ def one_light(fits):
 def test_one_light_needs_its_neighbours(need, one_light):
     need("llvm")
     (found,) = demand(PLANE, parameters=one_light, size=SIZE, grid=1, margin=MARGIN).values()
-    from btfref.render.scene import read_scene
+    from btfref.scene.description import read_scene
 
     (light,) = read_scene(PLANE, one_light).lights
     index, weight = directions("ubo81").stencil(light.position)
@@ -54,7 +55,7 @@ def test_one_light_needs_its_neighbours(need, one_light):
 
 def brute_views(representation, parameters):
     """Views with weight at the pixels' centres, from the geometry of a pinhole before the plane z = 0."""
-    from btfref.render.scene import read_scene
+    from btfref.scene.description import read_scene
 
     scene = read_scene(PLANE, parameters, size=SIZE)
     corner, right, down = scene.camera.ray_basis()

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from btfref.compare.tolerances import tolerance
 from btfref.errors import InputError
-from btfref.numerics.quadrature import gauss_hemisphere
+from btfref.gates.tolerances import tolerance
+from btfref.numerics.sphere.quadrature import gauss_hemisphere
 from btfref.registry import image_light, methods
-from btfref.render import prefilter
-from btfref.render.environment import Environment, bright_texel, constant, from_emitter, sunsky
-from btfref.representations.analytic import held
+from btfref.rendering.environment_light import prefilter
+from btfref.representations.analytic.light_functions import held
+from btfref.scene.environment import Environment, bright_texel, constant, from_emitter, sunsky
 
 SMALL = {"size": 32}
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from btfref.compare.tolerances import tolerance
 from btfref.errors import InputError
-from btfref.numerics.harmonics import values
-from btfref.render import environments
-from btfref.render.reference import render
-from btfref.render.scene import read_scene
-from btfref.scenes import scene_file
+from btfref.gates.tolerances import tolerance
+from btfref.numerics.sphere.harmonics import values
+from btfref.rendering.offline.reference import render
+from btfref.scene import environments
+from btfref.scene.description import read_scene
+from btfref.scene.shipped import scene_file
 
 
 @pytest.mark.parametrize("name", ["studio", "harmonics", "bright-texel", "constant"])

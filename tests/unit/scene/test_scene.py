@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from btfref.compare import tolerance
 from btfref.errors import InputError
-from btfref.numerics.frames import shading_frame
-from btfref.render.scene import read_scene
-from btfref.render.shapes import BtfMaterial, neighbours
-from btfref.scenes import meshes
+from btfref.gates import tolerance
+from btfref.numerics.sphere.frames import shading_frame
+from btfref.scene.description import read_scene
+from btfref.scene.shapes import BtfMaterial, neighbours
+from btfref.scene.shipped import meshes
 
 
 @pytest.fixture
@@ -255,7 +255,7 @@ def test_shipped_meshes_are_what_the_script_writes(name, tmp_path):
     from importlib.resources import files
 
     meshes.write(tmp_path)
-    assert (tmp_path / f"{name}.ply").read_bytes() == files("btfref.scenes").joinpath(
+    assert (tmp_path / f"{name}.ply").read_bytes() == files("btfref.scene.shipped").joinpath(
         f"{name}.ply"
     ).read_bytes()
     positions, normals, uv, faces = meshes.surface_mesh(name)

@@ -10,14 +10,15 @@ import pytest
 from browser import browse
 from schemas import assert_follows_schema
 
-from btfref.compare.colour import Display
-from btfref.compare.waterfall import Picture, waterfall
+from btfref import provenance as caching
+from btfref.comparison.waterfall import Picture, waterfall
 from btfref.errors import InputError
+from btfref.images.display import Display
+from btfref.provenance import code_of, method_files
 from btfref.registry import methods
 from btfref.report.pack import pack, unpack, unpack_text
 from btfref.report.validation import write_validation
-from btfref.validate import cache as caching
-from btfref.validate.cache import Cache, code_of, method_files
+from btfref.validate.cache import Cache
 from btfref.validate.cell import GATES, CellResult, eight_bits, failed_cell, read_cell
 from btfref.validate.cell import _save as save_cell
 from btfref.validate.material import fit_key, material_key

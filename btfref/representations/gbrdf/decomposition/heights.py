@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.decomposition.pairs import shifted, tangent
+from btfref.representations.gbrdf.decomposition.pairs import shifted, tangent
 
 #: Variance of log luminance in a window that counts as texture: below it a correlation is noise and fades to 0.
 _QUIET = 1e-4
@@ -25,7 +25,7 @@ def similarity(pairs, layers, window=5, progress=None):
 
     Parameters
     ----------
-    pairs : btfref.decomposition.pairs.ReciprocalPairs
+    pairs : btfref.representations.gbrdf.decomposition.pairs.ReciprocalPairs
     layers : ndarray, shape (n_layers,)
         Heights in tile units.
     window : int
@@ -162,7 +162,7 @@ def reciprocity_similarity(pairs, layers, progress=None):
 
     Parameters
     ----------
-    pairs : btfref.decomposition.pairs.ReciprocalPairs
+    pairs : btfref.representations.gbrdf.decomposition.pairs.ReciprocalPairs
     layers : ndarray, shape (n_layers,)
     progress : callable, optional
 

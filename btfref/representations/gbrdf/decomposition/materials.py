@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from btfref.numerics.parabolic import bilinear_stencil
+from btfref.numerics.sphere.parabolic import bilinear_stencil
 
 #: Polar and azimuthal samples over which distributions are compared.
 N_THETA, N_PHI = 8, 32

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from btfref.decomposition.pairs import surface_stencil, tangent
 from btfref.numerics.heightfield import HeightField
+from btfref.representations.gbrdf.decomposition.pairs import surface_stencil, tangent
 
 #: Largest slope that is looked for: 80° from the plane.
 SLOPE_LIMIT = 5.0
@@ -43,7 +43,7 @@ def helmholtz_normals(pairs, heights, progress=None):
 
     Parameters
     ----------
-    pairs : btfref.decomposition.pairs.ReciprocalPairs
+    pairs : btfref.representations.gbrdf.decomposition.pairs.ReciprocalPairs
     heights : ndarray, shape (rows, columns)
         Tile units; where the images are looked up, and what v (visible from both directions) is decided by.
     progress : callable, optional
@@ -52,9 +52,9 @@ def helmholtz_normals(pairs, heights, progress=None):
     -------
     slopes : ndarray of float64, shape (rows, columns, 2)
     summary : dict
-        Of the fits; see :class:`btfref.numerics.levenberg.BatchFit`.
+        Of the fits; see :class:`btfref.numerics.solvers.levenberg.BatchFit`.
     """
-    from btfref.numerics.levenberg import backend, fit_batch
+    from btfref.numerics.solvers.levenberg import backend, fit_batch
 
     shape, n = heights.shape, heights.size
     if not len(pairs):

@@ -6,14 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
-from btfref.decomposition import heights as height_stage
-from btfref.decomposition.materials import cluster_materials
-from btfref.decomposition.normals import fuse, helmholtz_normals
-from btfref.decomposition.pairs import N_PAIRS, ReciprocalPairs
-from btfref.decomposition.reflectance import SurfaceSamples, material_reflectance, texel_reflectance
 from btfref.errors import InputError
 from btfref.numerics.heightfield import HEIGHT_LIMIT, HeightField
-from btfref.representations.gbrdf_build import from_maps
+from btfref.representations.gbrdf.build import from_maps
+from btfref.representations.gbrdf.decomposition import heights as height_stage
+from btfref.representations.gbrdf.decomposition.materials import cluster_materials
+from btfref.representations.gbrdf.decomposition.normals import fuse, helmholtz_normals
+from btfref.representations.gbrdf.decomposition.pairs import N_PAIRS, ReciprocalPairs
+from btfref.representations.gbrdf.decomposition.reflectance import (
+    SurfaceSamples,
+    material_reflectance,
+    texel_reflectance,
+)
 from btfref.representations.lookup import positive_integer
 
 #: What heights can be told by.
@@ -68,7 +72,7 @@ def fit(
         correlation of windows (eq. 5). On the checker, whose squares have no texture inside, the heights of the latter
         are four times as wrong.
     smoothness : float
-        Of the minimum cut; see `btfref.decomposition.heights.minimum_cut`.
+        Of the minimum cut; see `btfref.representations.gbrdf.decomposition.heights.minimum_cut`.
     depth_weight : float
         λ of the fusion of heights and normals, (0, 1].
     materials : int, optional
@@ -88,7 +92,7 @@ def fit(
 
     Returns
     -------
-    btfref.representations.gbrdf.Representation
+    btfref.representations.gbrdf.definition.Representation
         ``meta["fit"]``: ``materials``, ``separation``, ``normals`` (convergence).
 
     Raises

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from btfref.conventions import LUMINANCE
-from btfref.decomposition.normals import visible
-from btfref.decomposition.pairs import surface_stencil, tangent
-from btfref.numerics.frames import surface_frame
 from btfref.numerics.microfacets import fifth_power, geometry_factor
-from btfref.numerics.parabolic import texel_solid_angles
+from btfref.numerics.sphere.frames import surface_frame
+from btfref.numerics.sphere.parabolic import texel_solid_angles
+from btfref.representations.gbrdf.decomposition.normals import visible
+from btfref.representations.gbrdf.decomposition.pairs import surface_stencil, tangent
 
 #: Texels a block: bounds the memory of their tables.
 BLOCK = 128

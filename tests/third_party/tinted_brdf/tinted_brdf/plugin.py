@@ -3,8 +3,8 @@
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_plugins.lookup import texel_stencil
-from mitsuba_plugins.tables import PairTable, read_packets, wide
+from mitsuba_plugins.lib.lookup import texel_stencil
+from mitsuba_plugins.lib.tables import PairTable, read_packets, wide
 
 
 class Evaluator:

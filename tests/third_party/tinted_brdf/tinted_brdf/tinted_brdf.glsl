@@ -1,8 +1,8 @@
 // Provides btf_eval of one apparent BRDF times a colour a texel.
-// Expects brdf [view, light, 3], tint [row, column, 3], the tables of lib/directions.glsl.
+// Expects brdf [view, light, 3], tint [row, column, 3], the tables of lib/lookup/directions.glsl.
 
-#include "lib/directions.glsl"
-#include "lib/texels.glsl"
+#include "lib/lookup/directions.glsl"
+#include "lib/lookup/texels.glsl"
 
 uniform sampler2DArray brdf;
 uniform sampler2DArray tint;

@@ -1,0 +1,1 @@
+"""Bonn's binary BTFs: DFMF, FMF, PVF and BDI."""

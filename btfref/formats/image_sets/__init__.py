@@ -1,0 +1,1 @@
+"""BTFs as one picture per pair of directions: UBO, UTIA, SPECTRAL."""

@@ -1,0 +1,1 @@
+"""Fitting: low rank, clusters, factors, least squares; and how many threads BLAS gets."""

@@ -1,0 +1,1 @@
+"""Functions of directions: sets, interpolation, quadrature, maps and frames."""

@@ -1,0 +1,1 @@
+"""Light from environments: prefiltered maps, harmonics, transfer, sets of lights; for shaders and in float64."""

@@ -1,0 +1,1 @@
+"""OpenGL without a window: device, shader composer, rasterizer, probe, renderer."""

@@ -1,0 +1,1 @@
+"""Methods that are products of maps of single directions: `cmf`, `hf`."""

@@ -1,0 +1,1 @@
+"""g-BRDF: a height field with a few microfacet materials, made for editing."""

@@ -1,0 +1,1 @@
+"""Laplacian pyramid of a BTF with principal components per level."""

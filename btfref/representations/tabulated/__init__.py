@@ -1,0 +1,1 @@
+"""Methods that keep tables over both directions: `raw`, `svd`, `lpca`."""

@@ -1,0 +1,1 @@
+"""The reference estimator: paths from the view side, shared by all lights."""

@@ -1,0 +1,1 @@
+"""The Zarr store of a sampled BTF: its files, its parts, and how a run resumes."""

@@ -1,0 +1,1 @@
+"""What the ports of several methods share."""
