@@ -26,7 +26,7 @@ test-long: setup-tests
 	@$(BIN)/python -m pytest -m "long or not long" $(PYTEST_ARGS)
 
 lint: $(TESTS)
-	@$(BIN)/ruff check && $(BIN)/ruff format --check
+	@$(BIN)/ruff check && $(BIN)/ruff format --check && $(BIN)/mypy
 
 setup: $(PACKAGE)
 	@$(BIN)/python -m btfref doctor --mend
