@@ -83,10 +83,10 @@ def identify(path):
     InputError
         Missing or empty file, or an archive that is damaged or dangerous.
     """
-    from btfref.formats.image_sets.files import Probe
+    from btfref.formats.image_sets.files import Candidate
 
-    probe = Probe(path)
-    return next((name for name in names() if format_named(name).recognises(probe)), None)
+    candidate = Candidate(path)
+    return next((name for name in names() if format_named(name).recognises(candidate)), None)
 
 
 def open_source(path, *, format=None, **options):

@@ -21,13 +21,13 @@ SCALE = np.array([1.0, 1.15, 1.66]) / 1500
 _LARGEST = 4096
 
 
-def recognises(probe):
+def recognises(candidate):
     """Whether the counts in front explain the size of the file."""
-    if len(probe.head) < 12:
+    if len(candidate.head) < 12:
         return False
-    counts = struct.unpack_from("<3i", probe.head)
+    counts = struct.unpack_from("<3i", candidate.head)
     return all(0 < n <= _LARGEST for n in counts) and (
-        probe.path.suffix == ".binary" or 12 + 24 * counts[0] * counts[1] * counts[2] == probe.size
+        candidate.path.suffix == ".binary" or 12 + 24 * counts[0] * counts[1] * counts[2] == candidate.size
     )
 
 

@@ -30,9 +30,9 @@ _LARGEST_XML = 64 << 20
 _LARGEST_SIDE = 1 << 16
 
 
-def recognises(probe):
+def recognises(candidate):
     """Whether the file starts with the magic chunk."""
-    return probe.head.startswith(MAGIC)
+    return candidate.head.startswith(MAGIC)
 
 
 def open_mif(path, *, allow_missing=False):

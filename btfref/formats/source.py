@@ -96,7 +96,8 @@ class Format:
     ----------
     name, title : str
     recognises : callable
-        ``recognises(probe) -> bool``, from the first bytes and the names (`btfref.formats.image_sets.files.Probe`).
+        ``recognises(candidate) -> bool``, from the first bytes and the names of a
+        `btfref.formats.image_sets.files.Candidate`.
     open : callable
         ``open(path, **options) -> Source``; raises InputError.
     options : frozenset of str

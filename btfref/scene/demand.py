@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.scene.first_hits import MARGIN, Lookups, light_directions
+from btfref.scene.first_hits import MARGIN, Touched, light_directions
 
 #: Levels of detail by which a footprint may be off.
 LEVEL_MARGIN = 0.01
@@ -146,7 +146,7 @@ def demand(
     wanted = {}
     for mesh in description.meshes:
         if mesh.material is not None and mesh.material.filename not in wanted:
-            wanted[mesh.material.filename] = Lookups(mesh.material.filename, shape, least)
+            wanted[mesh.material.filename] = Touched(mesh.material.filename, shape, least)
     from_everywhere = description.environment is not None
     offsets = grid_offsets(grid)
     with loaded(scene, parameters, size=size, plain=True) as made:

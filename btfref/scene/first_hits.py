@@ -16,7 +16,7 @@ LARGEST_CHANGE = 0.25
 _SHIFTS = np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
 
 
-class Lookups:
+class Touched:
     """Gathers what lookups of one BTF touch.
 
     Parameters

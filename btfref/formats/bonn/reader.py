@@ -19,9 +19,9 @@ _SCALARS = {2: "<f2", 4: "<f4", 8: "<f8"}
 _LARGEST_RANK = 1 << 16
 
 
-def recognises(probe):
+def recognises(candidate):
     """Whether the file starts with one of Bonn's signatures."""
-    return signature_of(probe.head) is not None
+    return signature_of(candidate.head) is not None
 
 
 def open_bonn(path):

@@ -23,8 +23,8 @@ LARGEST_RATIO = 200
 IMAGES = (".jpg", ".jpeg", ".png", ".exr", ".hdr")
 
 
-class Probe:
-    """What formats are recognised by.
+class Candidate:
+    """A file or folder that may be of one of the formats: what these recognise themselves by.
 
     Attributes
     ----------

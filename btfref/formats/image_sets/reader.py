@@ -17,10 +17,10 @@ NOTE = "btfref.json"
 
 
 def recogniser(style):
-    """``recognises(probe)`` of folders and archives whose names are of that style."""
+    """``recognises(candidate)`` of folders and archives whose names are of that style."""
 
-    def recognises(probe):
-        return probe.files is not None and style_of(probe.files.images()) == style
+    def recognises(candidate):
+        return candidate.files is not None and style_of(candidate.files.images()) == style
 
     return recognises
 

@@ -98,7 +98,7 @@ def probe_environment(rep, light, uv, w_view, to_world, *, filter_type=None):
     if not len(points):
         tables.release()
         return np.zeros((0, 3), np.float32)
-    with Probe(tables, "hosts/probe_environment.vert", names, points) as made:
+    with PointProbe(tables, "hosts/probe_environment.vert", names, points) as made:
         total = 0
         for values in light.passes:
             made.run(values)
@@ -106,7 +106,7 @@ def probe_environment(rep, light, uv, w_view, to_world, *, filter_type=None):
         return total
 
 
-class Probe:
+class PointProbe:
     """A vertex host on the GPU, with points to evaluate: a result of each; a context manager.
 
     Parameters
@@ -166,10 +166,10 @@ class Probe:
 
 
 def probe_points(rep, points, *, filter_type=None, result=("value", 3)):
-    """A :class:`Probe` of ``rep`` at rows of :func:`broadcast_points`; the caller runs and releases it."""
+    """A :class:`PointProbe` of ``rep`` at rows of :func:`broadcast_points`; the caller runs and releases it."""
     names = {"uv": 2, "w_light": 3, "w_view": 3, "lod": 1}
     tables = device.ShaderRepresentation.upload(device.context(), rep, filter_type=filter_type)
-    return Probe(tables, "hosts/probe.vert", names, points, result)
+    return PointProbe(tables, "hosts/probe.vert", names, points, result)
 
 
 def broadcast_points(uv, w_light, w_view, lod=0.0):

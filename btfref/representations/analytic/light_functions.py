@@ -27,7 +27,7 @@ GUIDE_MEMBERS = 16
 
 
 @dataclass(frozen=True)
-class Lookups:
+class HeldStencils:
     """N lookups: neighbours (indices and weights, (N, T), (N, V)) and directions held at the measured edge (N, 3)."""
 
     texel: np.ndarray
@@ -46,7 +46,7 @@ def evaluate_analytic(representation, kernel, uv, w_light, w_view):
     representation : Representation
         Its meta holds the constants ``light_edge`` and ``view_edge``.
     kernel : callable
-        ``Lookups -> (N, 3)`` float64.
+        ``HeldStencils -> (N, 3)`` float64.
     uv, w_light, w_view : array_like, shape (..., 2), (..., 3), (..., 3)
 
     Returns
@@ -61,7 +61,7 @@ def evaluate_analytic(representation, kernel, uv, w_light, w_view):
         view, view_weight = views.stencil(w_view)
         light, fade = held(w_light, meta["constants"]["light_edge"])
         held_view, _ = held(w_view, meta["constants"]["view_edge"])
-        return fade[:, None] * kernel(Lookups(texel, texel_weight, view, view_weight, light, held_view))
+        return fade[:, None] * kernel(HeldStencils(texel, texel_weight, view, view_weight, light, held_view))
 
     return evaluate_points(lookup, uv, w_light, w_view)
 
