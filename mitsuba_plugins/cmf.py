@@ -8,7 +8,7 @@ import mitsuba as mi
 from btfref.representations.factored.definition import FACTORS, index_slots, raised
 from mitsuba_plugins.lib.lookup import texel_stencil
 from mitsuba_plugins.lib.parabolic import ParabolicMaps, bilinear_stencil, half_difference, unpacked
-from mitsuba_plugins.lib.tables import read_packets, wide
+from mitsuba_plugins.lib.tables import as_float32, read_packets
 
 
 class Evaluator:
@@ -36,7 +36,7 @@ class Evaluator:
     @staticmethod
     def _readable(tensor):
         """Values of a map of scales: floats, or words of four codes."""
-        return mi.UInt32(tensor.array) if dr.is_integral_v(tensor.array) else wide(tensor)
+        return mi.UInt32(tensor.array) if dr.is_integral_v(tensor.array) else as_float32(tensor)
 
     @staticmethod
     def _colour(values, at, power, active):

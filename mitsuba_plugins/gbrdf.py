@@ -10,7 +10,7 @@ from btfref.numerics.sphere.frames import ROTATION_FLOOR
 from mitsuba_plugins.lib.heightfield import HeightField
 from mitsuba_plugins.lib.microfacets import HalfVectors, Microfacets
 from mitsuba_plugins.lib.parabolic import ParabolicMaps, bilinear_stencil, half_sum
-from mitsuba_plugins.lib.tables import wide
+from mitsuba_plugins.lib.tables import as_float32
 
 
 class Evaluator:
@@ -28,8 +28,8 @@ class Evaluator:
         """Take over changed maps."""
         tensors = maps.tensors
         self.field = HeightField(tensors["cells"].array, self.shape, self.constants)
-        self.surface, self.gloss = wide(tensors["surface"]), wide(tensors["gloss"])
-        self.colour, self.ndf = wide(tensors["colour"]), ParabolicMaps(tensors["ndf"], 1)
+        self.surface, self.gloss = as_float32(tensors["surface"]), as_float32(tensors["gloss"])
+        self.colour, self.ndf = as_float32(tensors["colour"]), ParabolicMaps(tensors["ndf"], 1)
         self.half_vectors = HalfVectors(tensors["ndf"].numpy())
 
     def hit(self, uv, w_view, active):

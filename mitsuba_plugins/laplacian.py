@@ -11,14 +11,14 @@ from btfref.numerics.ycbcr import TO_RGB
 from mitsuba_plugins.lib.analytic import held, safe_power
 from mitsuba_plugins.lib.footprint import probes
 from mitsuba_plugins.lib.lookup import Neighbour, texel_stencil
-from mitsuba_plugins.lib.tables import PairTable, read_packets, wide
+from mitsuba_plugins.lib.tables import PairTable, as_float32, read_packets
 
 #: Sums are split at multiples of this: their upper parts add up without rounding. The channels and levels of a dark
-#: value cancel, and the rounding of a plain sum would then show; see shaders/lib/numbers/careful_sum.glsl.
+#: value cancel, and the rounding of a plain sum would then show; see shaders/lib/numbers/split_sum.glsl.
 QUANTUM = 2.0**-14
 
 
-class CarefulSum:
+class SplitSum:
     """A sum of colours in two parts."""
 
     DRJIT_STRUCT = {"high": mi.Color3f, "rest": mi.Color3f}  # noqa: RUF012 - read by Dr.Jit
@@ -30,7 +30,7 @@ class CarefulSum:
     def plus(self, term):
         """The sum with a further colour."""
         high = dr.floor(dr.fma(term, 1 / QUANTUM, 0.5)) * QUANTUM
-        return CarefulSum(self.high + high, self.rest + (term - high))
+        return SplitSum(self.high + high, self.rest + (term - high))
 
     def value(self):
         """The colour."""
@@ -85,13 +85,13 @@ class Evaluator:
         tensors = maps.tensors
         self.differentiable = any(dr.grad_enabled(tensors[name]) for name in ("basis", "weights"))
         self.basis = Bands(tensors["basis"], self.lights.following(), self.counts)
-        self.weights, self.width = wide(tensors["weights"]), tensors["weights"].shape[-1]
+        self.weights, self.width = as_float32(tensors["weights"]), tensors["weights"].shape[-1]
         self.mean, self.phong = None, None
         if "mean" in tensors:
             mean = tensors["mean"]
             self.mean = Bands(type(mean)(mean.array, (1, *mean.shape)), self.lights.following(), (1, 1, 1))
         else:
-            self.phong = wide(tensors["phong"])
+            self.phong = as_float32(tensors["phong"])
 
     def evaluate(self, uv, w_light, w_view, active, lod=0.0, step=None, ratio=None):
         """B in 1/sr for valid directions, or its mean along a footprint; may be slightly negative.
@@ -169,14 +169,14 @@ class Evaluator:
     def _mean(self, w_light, w_view, views, lights, active):
         """The mean of the coarsest level in Y, Cb, Cr."""
         if self.mean is not None:
-            return self.mean.combine(mi.UInt32(0), views, lights, [mi.Float(1)] * 3, active, CarefulSum())
+            return self.mean.combine(mi.UInt32(0), views, lights, [mi.Float(1)] * 3, active, SplitSum())
         p = read_packets(self.phong, mi.UInt32(0), 8, active)
         light, fade = held(w_light, self.edges[0])
         view, _ = held(w_view, self.edges[1])
         half = light + view
         cosine = half.z * dr.rsqrt(dr.squared_norm(half))
         luminance = dr.fma(p[2], safe_power(cosine, p[3]), dr.fma(p[1], light.z, p[0]))
-        return CarefulSum().plus(mi.Color3f(luminance, p[4], p[5]) * fade)
+        return SplitSum().plus(mi.Color3f(luminance, p[4], p[5]) * fade)
 
 
 def _heaviest(neighbours):

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_plugins.lib.lookup import texel_stencil
-from mitsuba_plugins.lib.tables import PairTable, read_packets, wide
+from mitsuba_plugins.lib.tables import PairTable, as_float32, read_packets
 
 
 class Evaluator:
@@ -23,7 +23,7 @@ class Evaluator:
         weights = maps.tensors["weights"]
         self.differentiable = dr.grad_enabled(weights) or dr.grad_enabled(maps.tensors["basis"])
         self.basis = PairTable(maps.tensors["basis"], self.lights.following())
-        self.weights, self.width = wide(weights), weights.shape[-1]
+        self.weights, self.width = as_float32(weights), weights.shape[-1]
         # Padding of the index map served the shader's texels only.
         self.cluster = mi.UInt32(maps.tensors["cluster"].array)
         self.cluster_stride = maps.tensors["cluster"].shape[-1]

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_plugins.lib.lookup import texel_stencil
-from mitsuba_plugins.lib.tables import PairTable, read_packets, wide
+from mitsuba_plugins.lib.tables import PairTable, as_float32, read_packets
 
 
 class Evaluator:
@@ -22,7 +22,7 @@ class Evaluator:
         """Take over changed maps."""
         basis, weights = maps.tensors["basis"], maps.tensors["weights"]
         self.basis = PairTable(type(basis)(basis.array, (1, *basis.shape)), self.lights.following())
-        self.weights, self.width = wide(weights), weights.shape[-1]
+        self.weights, self.width = as_float32(weights), weights.shape[-1]
 
     def evaluate(self, uv, w_light, w_view, active):
         """B in 1/sr for valid directions; may be slightly negative."""

@@ -78,7 +78,7 @@ def run(*, quick=False, progress=None, btf=None, only=None):
 def synthesis(folder, quick, progress):
     """Parts that scenes need against the whole: times, their law, bytes, pictures."""
     from btfref.numerics.sphere.directions import directions
-    from btfref.sampling.store.part import Part
+    from btfref.sampling.store.selection import Selection
     from btfref.sampling.synthesis import synthesize_store
     from btfref.scene.demand import demand
     from btfref.scene.shipped import scene_file
@@ -103,10 +103,10 @@ def synthesis(folder, quick, progress):
     views, lights = (tuple(np.flatnonzero(mask).tolist()) for mask in (few.views, few.lights))
     parts = {BASELINE: None} | {name: one.part() for name, one in needed.items()}
     parts |= {
-        "its views, all lights": Part(views),
-        "its lights, all views": Part(None, lights),
-        "its views, one light": Part(views, lights[:1]),
-        "single pair": Part(views[:1], lights[:1]),
+        "its views, all lights": Selection(views),
+        "its lights, all views": Selection(None, lights),
+        "its views, one light": Selection(views, lights[:1]),
+        "single pair": Selection(views[:1], lights[:1]),
     }
     settings = {"texels": texels, "spp": spp, "views": directions_name, "lights": directions_name}
     pairs, seconds = {}, {name: [] for name in parts}

@@ -174,12 +174,12 @@ def run(args):
             option = f"--{key.replace('_', '-')}"
             raise InputError("not a parameter of the mesostructure", field="--set", got=key, expected=option)
 
-    from btfref.sampling.store.part import Part
+    from btfref.sampling.store.selection import Selection
     from btfref.sampling.synthesis import synthesize_store
 
-    only = Part(args.only_views, args.only_lights, args.only_tiles)
+    only = Selection(args.only_views, args.only_lights, args.only_tiles)
     if args.scenes:
-        if only != Part():
+        if only != Selection():
             raise InputError("scenes say what is filled", field="--only-…", got="beside --for")
         found = union(args, args.scenes, whole_shape(args.views, args.lights, args.texels)).values()
         only = functools.reduce(operator.or_, found).part()

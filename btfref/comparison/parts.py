@@ -12,7 +12,7 @@ from btfref.comparison.waterfall import CONFIDENCE
 
 
 @dataclass(frozen=True)
-class Part:
+class StagePart:
     """A share of a stage that is measured on its own, at some of the pixels; see :func:`part`.
 
     Parameters
@@ -46,7 +46,7 @@ def part(name, of, test, reference, display):
 
     Returns
     -------
-    Part
+    StagePart
     """
     square = np.mean((np.asarray(test, float) - reference) ** 2, 1)
     colour, n = delta_e00(test, reference, display), max(len(square), 2)
@@ -54,4 +54,4 @@ def part(name, of, test, reference, display):
         interval(x.mean(), x.std() / np.sqrt(n - 1), confidence=CONFIDENCE, freedom=n - 1)
         for x in (square, colour)
     )
-    return Part(name, of, rmse_interval(mse), colour, len(square))
+    return StagePart(name, of, rmse_interval(mse), colour, len(square))

@@ -120,7 +120,7 @@ class Waterfall:
         Total − stages − covariances: 0 up to noise.
     products : tuple of Product
         The largest first.
-    parts : tuple of btfref.comparison.parts.Part
+    parts : tuple of btfref.comparison.parts.StagePart
         Shares of stages that are known by themselves.
     mean : float
         Mean of the first picture where it counts.
@@ -219,7 +219,7 @@ def waterfall(pictures, mask, display, *, parts=()):
         Pixels that count; at least one.
     display : btfref.comparison.Display
         For ΔE00.
-    parts : sequence of btfref.comparison.parts.Part
+    parts : sequence of btfref.comparison.parts.StagePart
         Shares of stages, to be told beside them.
 
     Returns

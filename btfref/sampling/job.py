@@ -19,8 +19,8 @@ from btfref.sampling.paths import adaptive
 from btfref.sampling.paths.texels import STREAMS
 from btfref.sampling.scheduling import run
 from btfref.sampling.store.layout import TILE, remove_leftovers
-from btfref.sampling.store.part import Part
 from btfref.sampling.store.resume import resumable
+from btfref.sampling.store.selection import Selection
 from btfref.sampling.store.store import create_store
 from btfref.sampling.variant import mitsuba_variant
 
@@ -174,7 +174,7 @@ class Job:
         if stage == "pilot":
             pilots = store.maps("pilot")
             return [int(view) for view in views if not np.isfinite(pilots[view, 0, 0, 0])]
-        only = only or Part()
+        only = only or Selection()
         wanted, (*_, tiles) = only.wanted(store), only.indices(store)
         covered = store.coverage[:, :, tiles[0], tiles[1]].all(-1)
         return [int(view) for view in views if (wanted[view] & ~covered[view]).any()]
@@ -197,7 +197,7 @@ class Job:
                 attributes=self.attributes,
                 adaptive=self.target_error is not None,
             )
-        only = only or Part()
+        only = only or Selection()
         views, *_ = only.indices(store)
         peak, plan = 0, None
         if self.target_error is not None:

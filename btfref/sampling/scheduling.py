@@ -8,7 +8,7 @@ import threading
 from pathlib import Path
 
 from btfref.errors import InputError, MissingDependencyError
-from btfref.sampling.filling import fill
+from btfref.sampling.fill_views import fill_views
 from btfref.sampling.memory import default_budget, peak
 from btfref.sampling.store.layout import DRAFT
 from btfref.sampling.store.store import open_store
@@ -33,12 +33,12 @@ def run(
     workers=None,
     progress=None,
 ):
-    """Fill views of a store; see `btfref.sampling.filling.fill`.
+    """Fill views of a store; see `btfref.sampling.fill_views.fill_views`.
 
     Parameters
     ----------
     job, store, views, stage, only, plan
-        As for `fill`.
+        As for `fill_views`.
     memory : int, optional
         Budget in bytes of this process and of all workers that it starts together, or of each worker of a
         cluster that runs elsewhere; by default half of the machine's memory.
@@ -72,7 +72,9 @@ def run(
 
     if scheduler is None:
         memory = default_budget() if memory is None else memory
-        fill(job, store, views, stage=stage, only=only, plan=plan, memory=memory, done=lambda view: done(1))
+        fill_views(
+            job, store, views, stage=stage, only=only, plan=plan, memory=memory, done=lambda view: done(1)
+        )
         return peak()
     if not views:
         return peak()
@@ -190,7 +192,7 @@ def _work(order, path, views, stage, settings):
         store = open_store(path)
         _use_threads(job, settings["threads"] or get_worker().state.nthreads)
         memory = default_budget() if settings["memory"] is None else settings["memory"]
-        fill(
+        fill_views(
             job,
             store,
             job.unfinished(store, views, stage, only),

@@ -159,7 +159,7 @@ def synthesize_store(
     out : path-like
     mesostructure, overwrite, progress, memory, scheduler, workers, **settings
         As for `synthesize`.
-    only : Part, optional
+    only : Selection, optional
         What to fill now; the rest can be filled later, by the same call with another part.
     report : callable, optional
         Called at the end as ``report(peak)``: largest memory (bytes) of any process that worked.

@@ -67,7 +67,7 @@ class Demand:
         return padded.reshape(rows, side, columns, side).any((1, 3))
 
     def part(self, side=None):
-        """What to synthesize: a `btfref.sampling.store.part.Part` of pairs, and of tiles as stores have them.
+        """What to synthesize: a `btfref.sampling.store.selection.Selection` of pairs, and of tiles as stores have them.
 
         Raises
         ------
@@ -75,12 +75,12 @@ class Demand:
             When nothing is needed.
         """
         from btfref.sampling.store.layout import TILE
-        from btfref.sampling.store.part import Part
+        from btfref.sampling.store.selection import Selection
 
         tiles = np.flatnonzero(self.tiles(side or TILE))
         if not self.pairs.any() or not len(tiles):
             raise InputError("the scene needs nothing of this BTF", file=self.file, field="demand")
-        return Part.of_pairs(self.pairs, tiles.tolist())
+        return Selection.of_pairs(self.pairs, tiles.tolist())
 
     def first_level(self, total):
         """Finest of ``total`` levels of detail that is needed; a little finer than found, since renderers round."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from btfref.numerics.sphere.halfway import LENGTHEN, SHORT
 from btfref.representations.factored.definition import raised
-from mitsuba_plugins.lib.tables import HALF_LIMIT, HALF_SCALE, HALF_SHIFT, read_packets, wide, widened
+from mitsuba_plugins.lib.tables import HALF_LIMIT, HALF_SCALE, HALF_SHIFT, as_float32, read_packets, widened
 
 
 def half_sum(w_light, w_view):
@@ -80,7 +80,7 @@ class ParabolicMaps:
             dr.eval(self.values)
             self.kind = "words"
         elif self.kind != dr.VarType.UInt32:
-            self.values = wide(values)
+            self.values = as_float32(values)
 
     def lookup(self, slice_index, stencil, active=True):
         """Bilinear lookup in a slice; a Color3f.

@@ -63,7 +63,7 @@ class PairTable:
         halves = values.numpy() if packable else None
         # Moved bits make a number of NaN, which stands for what is not there: such tables stay as they are.
         if not packable or not np.abs(halves).max() <= HALF_LIMIT:
-            self.values = wide(values)
+            self.values = as_float32(values)
             return
         halves = (halves * np.float16(HALF_SHIFT)).view(np.uint16)
         if self.following is None:
@@ -171,7 +171,7 @@ def _add(total, values, coefficients, weight):
     return mi.Color3f(*result)
 
 
-def wide(values):
+def as_float32(values):
     """Values of a table as float32, which is read in packets; gradients pass the conversion."""
     result = mi.Float(values.array)
     dr.eval(result)

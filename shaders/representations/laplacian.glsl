@@ -1,7 +1,7 @@
 // Provides btf_eval of a Laplacian pyramid: the mean and the levels from floor(lod) on; finer ones are not fetched.
 // Expects basis [level, view, light, component], weights [texels of all levels, component], mean or phong.
 
-#include "lib/numbers/careful_sum.glsl"
+#include "lib/numbers/split_sum.glsl"
 #include "lib/lookup/directions.glsl"
 #include "lib/surface/footprint.glsl"
 #include "lib/lookup/hold.glsl"
@@ -50,7 +50,7 @@ vec3 channel_sum(int i, vec4 product) {
     return sum;
 }
 
-CarefulSum with_mean(CarefulSum sum, vec3 w_light, vec3 w_view, Stencil views, Stencil lights) {
+SplitSum with_mean(SplitSum sum, vec3 w_light, vec3 w_view, Stencil views, Stencil lights) {
 #ifdef PHONG_DIM0
     // Ma et al. 2005, eq. 5 and 6: k_a + k_d (n.l) + k_s (n.h)^alpha for Y, constants for Cb and Cr.
     float fade, unused_fade;
@@ -58,14 +58,14 @@ CarefulSum with_mean(CarefulSum sum, vec3 w_light, vec3 w_view, Stencil views, S
     vec3 halfway = normalize(light + held(w_view, VIEW_EDGE, unused_fade));
     vec4 k = table_fetch(phong, 0);
     vec2 colour = table_fetch(phong, 1).xy;
-    return careful_add(sum, fade * vec3(k.x + k.y * light.z + k.z * safe_power(halfway.z, k.w), colour));
+    return split_add(sum, fade * vec3(k.x + k.y * light.z + k.z * safe_power(halfway.z, k.w), colour));
 #else
     for (int v = 0; v < 4; ++v) {
         for (int l = 0; l < 4; ++l) {
             float weight = views.weight[v] * lights.weight[l];
             if (weight != 0.0) {
                 int pair = views.index[v] * MEAN_DIM1 + lights.index[l];
-                sum = careful_add(sum, weight * table_fetch(mean, pair).rgb);
+                sum = split_add(sum, weight * table_fetch(mean, pair).rgb);
             }
         }
     }
@@ -73,7 +73,7 @@ CarefulSum with_mean(CarefulSum sum, vec3 w_light, vec3 w_view, Stencil views, S
 #endif
 }
 
-CarefulSum with_level(CarefulSum sum, int level, float share, vec2 uv, Stencil views, Stencil lights) {
+SplitSum with_level(SplitSum sum, int level, float share, vec2 uv, Stencil views, Stencil lights) {
     vec4 coefficient[BASIS_STRIDE];
     for (int i = 0; i < BASIS_STRIDE; ++i) {
         coefficient[i] = vec4(0.0);
@@ -102,7 +102,7 @@ CarefulSum with_level(CarefulSum sum, int level, float share, vec2 uv, Stencil v
                 for (int i = 0; i < BASIS_STRIDE; ++i) {
                     pair += channel_sum(4 * i, coefficient[i] * table_fetch(basis, at + i));
                 }
-                sum = careful_add(sum, weight * pair);
+                sum = split_add(sum, weight * pair);
             }
         }
     }
@@ -122,7 +122,7 @@ vec3 btf_eval(vec2 uv, vec3 w_light, vec3 w_view, float lod) {
 #endif
     Stencil views = direction_choice(view_stencil(w_view));
     Stencil lights = direction_choice(light_stencil(w_light));
-    CarefulSum sum = with_mean(CarefulSum(vec3(0.0), vec3(0.0)), w_light, w_view, views, lights);
+    SplitSum sum = with_mean(SplitSum(vec3(0.0), vec3(0.0)), w_light, w_view, views, lights);
     // Ma et al. 2005, eq. 7: w_k = clamp(1 - lod + k, 0, 1).
     for (int level = int(lod); level < N_LEVELS; ++level) {
         float share = clamp(1.0 - lod + float(level), 0.0, 1.0);

@@ -3,7 +3,7 @@
 import pytest
 
 from btfref.sampling import SampledBTF
-from btfref.sampling.store.part import Part
+from btfref.sampling.store.selection import Selection
 from btfref.sampling.synthesis import synthesize_store
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -20,7 +20,7 @@ def test_raw_sizes_of_the_factorization_paper(tmp_path, name, views):
     texels, directions_, size = RAW[name]
     store = synthesize_store(
         tmp_path / "a.btf.zarr", name, texels=texels, views=directions_, lights=directions_, spp=2, max_depth=2,
-        only=None if views is None else Part(views=views), variance=False,
+        only=None if views is None else Selection(views=views), variance=False,
     )  # fmt: skip
     assert store.complete == (views is None)
     assert store.info()["raw_bytes"] / 2**20 == pytest.approx(size, abs=0.05)

@@ -10,7 +10,7 @@ from btfref.gates.tolerances import tolerance
 from btfref.mesostructure import build
 from btfref.numerics.sphere.directions import directions
 from btfref.sampling import SampledBTF, open_store
-from btfref.sampling.store.part import Part
+from btfref.sampling.store.selection import Selection
 from btfref.sampling.synthesis import synthesize, synthesize_store
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -109,10 +109,10 @@ def test_parts_add_up_to_the_same_store(tmp_path, estimator):
     settings = SMALL | {"estimator": estimator, "seed": 3, "resolution": 16}
     whole = synthesize("checker", out=tmp_path / "whole.btf.zarr", **settings)
     out = tmp_path / "parts.btf.zarr"
-    store = synthesize_store(out, "checker", only=Part(views=(1, 4)), **settings)
+    store = synthesize_store(out, "checker", only=Selection(views=(1, 4)), **settings)
     assert store.coverage.any(axis=(1, 2, 3)).tolist() == [False, True, False, False, True, False]
     assert store.info()["coverage_of"] == {"views": 2, "lights": 8, "pairs": "16 of 48", "tiles": "1 of 1"}
-    store = synthesize_store(out, "checker", only=Part(lights=(0, 5)), **settings)
+    store = synthesize_store(out, "checker", only=Selection(lights=(0, 5)), **settings)
     assert store.coverage.mean() == pytest.approx((2 * 8 + 4 * 2) / 48)
     with pytest.raises(InputError, match="incomplete"):
         SampledBTF.load(out)
@@ -124,7 +124,7 @@ def test_parts_add_up_to_the_same_store(tmp_path, estimator):
     assert np.array_equal(filled.values, whole.values)
     assert np.array_equal(filled.variance, whole.variance)
     with pytest.raises(InputError, match="part of a BTF"):
-        synthesize_store(out, "checker", only=Part(lights=(8,)), **settings)
+        synthesize_store(out, "checker", only=Selection(lights=(8,)), **settings)
 
 
 @pytest.mark.parametrize("estimator", ["path", "surface"])
@@ -133,7 +133,7 @@ def test_tiles_are_filled_alone(tmp_path, estimator):
     settings |= {"estimator": estimator, "resolution": 16}
     whole = synthesize("checker", **settings)
     out = tmp_path / "tiles.btf.zarr"
-    store = synthesize_store(out, "checker", only=Part(tiles=(1, 2)), **settings)
+    store = synthesize_store(out, "checker", only=Selection(tiles=(1, 2)), **settings)
     assert store.coverage[0, 0].tolist() == [[False, True], [True, False]]
     part = SampledBTF.load(out, rows=range(64), columns=range(64, 80), partial=True)
     assert np.array_equal(part.values, whole.values[:, :, :64, 64:])

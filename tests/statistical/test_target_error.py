@@ -11,7 +11,7 @@ from btfref.sampling import SampledBTF, open_store
 from btfref.sampling.paths import adaptive
 from btfref.sampling.paths.adaptive import make_plan
 from btfref.sampling.store import layout
-from btfref.sampling.store.part import Part as Selection
+from btfref.sampling.store.selection import Selection
 from btfref.sampling.synthesis import synthesize, synthesize_store
 
 pytestmark = pytest.mark.usefixtures("llvm")

@@ -15,7 +15,7 @@ from btfref.rendering.offline.reference import render
 from btfref.representations import load, save
 from btfref.representations.tabulated import raw
 from btfref.sampling import SampledBTF, open_store
-from btfref.sampling.store.part import Part
+from btfref.sampling.store.selection import Selection
 from btfref.sampling.synthesis import synthesize_store
 from btfref.scene.demand import MARGIN, Demand, demand, maps_needed
 from btfref.scene.shipped import scene_file
@@ -113,8 +113,8 @@ def test_union_and_parts():
     assert both.lights.nonzero()[0].tolist() == [0, 2]
     assert both.least_lod == 0.25
     assert both.lookups == 14
-    assert one.part() == Part((1, 3), (0,), (0,))
-    assert both.part(64) == Part(tiles=(0, 3), pairs=((1, (0, 2)), (3, (0,))))
+    assert one.part() == Selection((1, 3), (0,), (0,))
+    assert both.part(64) == Selection(tiles=(0, 3), pairs=((1, (0, 2)), (3, (0,))))
     assert both.tiles(32).sum() == 2
     with pytest.raises(InputError, match="needs nothing"):
         some([], [0], (0, 0)).part()
@@ -293,9 +293,9 @@ def test_parts_of_pairs(llvm, tmp_path):
     """Both estimators make pairs alone, with the bytes of the whole."""
     pairs = np.zeros((6, 6), bool)
     pairs[[0, 2, 2, 5], [1, 0, 5, 3]] = True
-    part = Part.of_pairs(pairs)
+    part = Selection.of_pairs(pairs)
     assert part.pairs == ((0, (1,)), (2, (0, 5)), (5, (3,)))
-    assert Part.of_pairs(np.eye(3, dtype=bool)[:, :1], (0,)) == Part((0,), (0,), (0,))
+    assert Selection.of_pairs(np.eye(3, dtype=bool)[:, :1], (0,)) == Selection((0,), (0,), (0,))
     for estimator in ("path", "surface"):
         made = {"texels": 4, "views": "2x3", "lights": "2x3", "spp": 4, "max_depth": 3, "resolution": 16}
         made["estimator"] = estimator
@@ -305,9 +305,9 @@ def test_parts_of_pairs(llvm, tmp_path):
         np.testing.assert_array_equal(some._values[:][pairs], full._values[:][pairs])
     for wrong in (((0, (6,)),), ((6, (0,)),), ((0, ()),), (), ((0, (1,)), (0, (2,)))):
         with pytest.raises(InputError, match="part of a BTF"):
-            Part(pairs=wrong).wanted(some)
+            Selection(pairs=wrong).wanted(some)
     with pytest.raises(InputError, match="part of a BTF"):
-        Part(views=(0,), pairs=((0, (1,)),)).wanted(some)
+        Selection(views=(0,), pairs=((0, (1,)),)).wanted(some)
     settings = {"texels": 4, "views": "2x3", "lights": "2x3", "target_error": 0.5}
     with pytest.raises(InputError, match="target error"):
         synthesize_store(tmp_path / "no.btf.zarr", "checker", only=part, **settings)
@@ -315,7 +315,7 @@ def test_parts_of_pairs(llvm, tmp_path):
 
 def test_missing_tiles_are_no_numbers(llvm, tmp_path):
     settings = {"texels": (8, 70), "views": "10x5", "lights": [[0, 0, 1]], "spp": 2}
-    part = Part(views=tuple(range(15)), tiles=(1,))
+    part = Selection(views=tuple(range(15)), tiles=(1,))
     store = synthesize_store(tmp_path / "part.btf.zarr", "checker", only=part, **settings)
     made = raw.fit_partial(store)
     save(made, tmp_path / "part.raw.exr")

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_plugins.lib.lookup import texel_stencil
-from mitsuba_plugins.lib.tables import PairTable, read_packets, wide
+from mitsuba_plugins.lib.tables import PairTable, as_float32, read_packets
 
 
 class Evaluator:
@@ -19,7 +19,7 @@ class Evaluator:
         """Take over changed maps."""
         brdf, tint = maps.tensors["brdf"], maps.tensors["tint"]
         self.brdf = PairTable(type(brdf)(brdf.array, (1, *brdf.shape)), self.lights.following())
-        self.tint = wide(tint)
+        self.tint = as_float32(tint)
 
     def evaluate(self, uv, w_light, w_view, active):
         """B in 1/sr for valid directions."""

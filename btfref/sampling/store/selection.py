@@ -1,4 +1,4 @@
-"""A part of a sampled BTF: some pairs of views and lights, some tiles."""
+"""A selection of a sampled BTF: some pairs of views and lights, some tiles."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from btfref.errors import InputError
 
 
 @dataclass(frozen=True)
-class Part:
+class Selection:
     """What to fill of a store.
 
     Attributes
@@ -40,7 +40,7 @@ class Part:
 
         Returns
         -------
-        Part
+        Selection
         """
         views, lights = (tuple(np.flatnonzero(pairs.any(axis)).tolist()) for axis in (1, 0))
         tiles = None if tiles is None else tuple(tiles)

@@ -9,14 +9,14 @@ import numpy as np
 
 from btfref.sampling.memory import blocks
 from btfref.sampling.paths import adaptive
-from btfref.sampling.store.part import Part
+from btfref.sampling.store.selection import Selection
 from btfref.sampling.variant import mitsuba_variant
 
 #: Streams of random numbers of a synthesis to a target error.
 _PILOT, _ESTIMATE = 1, 2
 
 
-def fill(job, store, views, *, stage, only=None, plan=None, memory, done=None):
+def fill_views(job, store, views, *, stage, only=None, plan=None, memory, done=None):
     """Make what is missing of some views.
 
     Parameters
@@ -26,7 +26,7 @@ def fill(job, store, views, *, stage, only=None, plan=None, memory, done=None):
     views : sequence of int
     stage : {"pilot", "synthesis"}
         What is made: the pilot of a synthesis to a target error, or values.
-    only : Part, optional
+    only : Selection, optional
         Lights and tiles that are wanted; all when not given. Pilots are made of everything.
     plan : Plan, optional
         Of a synthesis to a target error.
@@ -63,7 +63,7 @@ def fill(job, store, views, *, stage, only=None, plan=None, memory, done=None):
         ("surface", "synthesis"): _fill_by_views if plan is None else _fill_by_passes,
     }[job.estimator, stage]
     with mitsuba_variant(job.variant):
-        for view in work(job, store, views, only or Part(), plan, size):
+        for view in work(job, store, views, only or Selection(), plan, size):
             if done is not None:
                 done(view)
 
