@@ -1,40 +1,87 @@
-"""New files and folders: they appear under their names when they are complete, and never replace another."""
+"""New files and folders: they appear under their names when they are complete, and nothing is left behind otherwise."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from btfref.errors import InputError
+from btfref.types import PathLike
 
 
-def refuse_existing(path):
+def refuse_existing(path: PathLike) -> None:
     """InputError when the path is taken."""
+    path = Path(path)
     if path.exists() or path.is_symlink():
         raise InputError("exists already", file=path, expected="a new name (or to overwrite)")
 
 
+def require_folder_of(path: PathLike) -> None:
+    """InputError when the folder that a file or folder belongs in is not there."""
+    path = Path(path)
+    if not path.absolute().parent.is_dir():
+        raise InputError("no such folder", file=path.parent)
+
+
 @contextmanager
-def new_folder(out):
-    """A folder to fill, which gets its name ``out`` when all is written; nothing is left behind otherwise.
+def new_file(out: PathLike) -> Iterator[Path]:
+    """A name to write a file under, which becomes ``out`` when all is written, in place of an older file.
+
+    The file has the permissions that the user's umask gives to new files.
+
+    Parameters
+    ----------
+    out : path-like
+
+    Yields
+    ------
+    pathlib.Path
+        The last part is that of ``out``, for writers that look at endings.
+
+    Raises
+    ------
+    InputError
+        No folder to make it in.
+    """
+    with _draft(Path(out)) as draft:
+        yield draft
+        os.replace(draft, out)
+
+
+@contextmanager
+def new_folder(out: PathLike) -> Iterator[Path]:
+    """A folder to fill, which gets its name ``out`` when all is written.
+
+    Parameters
+    ----------
+    out : path-like
+
+    Yields
+    ------
+    pathlib.Path
 
     Raises
     ------
     InputError
         An existing path, or no folder to make it in.
     """
-    out = Path(out)
     refuse_existing(out)
-    if not out.absolute().parent.is_dir():
-        raise InputError("no such folder", file=out.parent)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.absolute().parent))
+    with _draft(Path(out)) as draft:
+        draft.mkdir()
+        yield draft
+        os.replace(draft, out)
+
+
+@contextmanager
+def _draft(out: Path) -> Iterator[Path]:
+    """The name of ``out`` in a temporary folder beside it: on the same disk, so that it can be renamed."""
+    require_folder_of(out)
+    folder = tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.absolute().parent)
     try:
-        folder = temporary / "maps"
-        folder.mkdir()
-        yield folder
-        os.replace(folder, out)
+        yield Path(folder, out.name)
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)

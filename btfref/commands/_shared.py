@@ -287,13 +287,10 @@ def save_classes(path, classes):
     import numpy as np
 
     from btfref.images.png import encode_png
+    from btfref.outputs import new_file
 
-    temporary = path.with_name(f".{path.name}.partial")
-    try:
-        temporary.write_bytes(encode_png(np.array(_CLASS_GREYS, np.uint8)[classes]))
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with new_file(path) as draft:
+        draft.write_bytes(encode_png(np.array(_CLASS_GREYS, np.uint8)[classes]))
 
 
 def load_classes(path):

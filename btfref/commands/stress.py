@@ -10,8 +10,6 @@ a command that shows it alone. Exit status 1 when anything failed.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from btfref.commands._shared import Progress, count, emit, emit_json, output_file
 from btfref.errors import InputError
 
@@ -38,6 +36,7 @@ def run(args):
     def words(text):
         return text.split(",") if text else None
 
+    from btfref.outputs import new_file
     from btfref.stress.runner import run as stress
     from btfref.stress.runner import show_case
     from btfref.stress.table import check_table, evaluator_table, failure_lines
@@ -66,7 +65,8 @@ def run(args):
     findings = result["findings"]
     if out:
         lines = [*evaluator_table(findings), "", *check_table(findings), ""]
-        Path(out).write_text("\n".join(lines), "utf-8")
+        with new_file(out) as draft:
+            draft.write_text("\n".join(lines), "utf-8")
     if args.json:
         emit_json(result | {"findings": [f.to_dict() for f in findings]})
     else:

@@ -10,6 +10,7 @@ import numpy as np
 from btfref.errors import InputError
 from btfref.formats import open_source
 from btfref.formats.source import MEMORY
+from btfref.outputs import require_folder_of
 from btfref.provenance import versions
 from btfref.sampling.store.layout import TILE, remove_leftovers, remove_store
 from btfref.sampling.store.resume import resumable
@@ -207,11 +208,9 @@ def _lights_at_a_time(source, dtype, memory):
 
 def _room_for(source, out, dtype):
     """InputError when the disk cannot hold the store."""
-    folder = out.absolute().parent
-    if not folder.is_dir():
-        raise InputError("no such folder", file=out.parent)
+    require_folder_of(out)
     need = int(source.present.sum()) * source.texels[0] * source.texels[1] * 3 * np.dtype(dtype).itemsize
-    free = shutil.disk_usage(folder).free
+    free = shutil.disk_usage(out.absolute().parent).free
     if need > free:
         raise InputError(
             "not enough room on the disk", file=out, got=f"{free} bytes", expected=f"{need} bytes"

@@ -10,6 +10,7 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.sphere.directions import NAMED_RINGS, RING_TOLERANCE, checked, directions, spherical
+from btfref.outputs import refuse_existing, require_folder_of
 
 #: Bytes that a conversion may hold at a time, unless told otherwise.
 MEMORY = 2 << 30
@@ -122,15 +123,12 @@ class Format:
 
     def export_checked(self, btf, path, settings):
         """`export` likewise, to a path that does not exist."""
-        from btfref.outputs import refuse_existing
-
         if self.export is None:
             raise InputError("this format is only read", field="format", got=repr(self.name))
         settings = self._known(settings, self.settings | {"progress"})
         path = Path(path)
         refuse_existing(path)
-        if not path.absolute().parent.is_dir():
-            raise InputError("no such folder", file=path.parent)
+        require_folder_of(path)
         return self.export(btf, path, **settings)
 
     def _known(self, given, known):

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +9,7 @@ import numpy as np
 from btfref.errors import InputError
 from btfref.images.display import Display
 from btfref.numerics.colour import decode_srgb
+from btfref.outputs import new_file
 
 _MAGIC = {".exr": b"\x76\x2f\x31\x01", ".png": b"\x89PNG\r\n\x1a\n"}
 
@@ -86,32 +84,16 @@ def save_image(path, image, *, display=None, attributes=None):
 
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(attributes or {})}
         channels = {"RGB": np.ascontiguousarray(image, np.float32)}
-        with replacing(path) as temporary:
-            OpenEXR.File(header, channels).write(str(temporary))
+        with new_file(path) as draft:
+            OpenEXR.File(header, channels).write(str(draft))
     elif kind == ".png":
         from btfref.images.png import encode_png
 
         encoded = (display or Display()).encoded(image)
-        with replacing(path) as temporary:
-            temporary.write_bytes(encode_png(np.round(encoded * 255).astype(np.uint8)))
+        with new_file(path) as draft:
+            draft.write_bytes(encode_png(np.round(encoded * 255).astype(np.uint8)))
     else:
         raise InputError("unknown kind of picture", file=path, got=repr(path.suffix), expected=".exr or .png")
-
-
-@contextlib.contextmanager
-def replacing(path):
-    """A temporary name beside `path` with its ending, moved over it on success and removed on failure."""
-    if not path.parent.is_dir():
-        raise InputError("no such folder", file=path.parent)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        yield temporary
-        temporary.chmod(0o644)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _load_exr(path):

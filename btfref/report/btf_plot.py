@@ -8,6 +8,7 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.colour import encode_srgb
+from btfref.outputs import new_file
 from btfref.sampling.store.store import open_store
 
 #: Most views and most lights of the contact sheet, lights of the apparent BRDFs, views that maps are averaged over.
@@ -62,12 +63,8 @@ def plot_btf(path, out, *, texel=None):
         f"{Path(path).name}: {name}, {rows} × {columns} texels, {len(store.views)} views × {len(store.lights)} lights",
         fontsize=13,
     )
-    draft = Path(out).with_name(Path(out).name + ".partial")
-    try:
+    with new_file(out) as draft:
         figure.savefig(draft, format="png", dpi=100)
-        draft.replace(out)
-    finally:
-        draft.unlink(missing_ok=True)
 
 
 def _spread(directions, count):

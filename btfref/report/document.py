@@ -76,7 +76,7 @@ def write_report(path, *, title, cells, facts):
     InputError
         No cells, pictures of different shapes within a cell, a wrong ending or a missing folder.
     """
-    from btfref.images.files import replacing
+    from btfref.outputs import new_file
 
     path, cells = Path(path), list(cells)
     if path.suffix.lower() not in (".html", ".htm"):
@@ -101,8 +101,8 @@ def write_report(path, *, title, cells, facts):
     for part in rest:
         name, _, text = part.partition("}}")
         head += slots[name] + text
-    with replacing(path) as temporary:
-        temporary.write_text(head, "utf-8")
-    with replacing(path.with_suffix(".json")) as temporary:
-        temporary.write_text(json.dumps(data, sort_keys=True, indent=1, allow_nan=False) + "\n", "utf-8")
+    with new_file(path) as draft:
+        draft.write_text(head, "utf-8")
+    with new_file(path.with_suffix(".json")) as draft:
+        draft.write_text(json.dumps(data, sort_keys=True, indent=1, allow_nan=False) + "\n", "utf-8")
     return path

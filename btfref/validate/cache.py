@@ -10,8 +10,9 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import tempfile
 from pathlib import Path
+
+from btfref.outputs import new_file
 
 
 def folder():
@@ -56,11 +57,6 @@ class Cache:
         pathlib.Path
         """
         path = self.path(key, suffix)
-        handle, temporary = tempfile.mkstemp(dir=self.root, prefix=f".{key}.", suffix=suffix)
-        os.close(handle)
-        try:
-            save(Path(temporary))
-            os.replace(temporary, path)
-        finally:
-            Path(temporary).unlink(missing_ok=True)
+        with new_file(path) as draft:
+            save(draft)
         return path

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import struct
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +12,7 @@ from btfref.formats.bonn import bdi, colour
 from btfref.formats.parts import open_parts
 from btfref.formats.source import MEMORY
 from btfref.numerics.solvers.threads import one_blas_thread
+from btfref.outputs import new_file
 from btfref.provenance import __version__
 
 #: Scan lines per chunk that the owners' writer uses.
@@ -70,17 +69,11 @@ def export_bonn(
     if family not in ("DFMF", "BDI"):
         raise InputError("family", field="family", got=repr(family), expected="DFMF or BDI")
     source, path = open_parts(btf), Path(path)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".partial", dir=path.absolute().parent)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            if family == "BDI":
-                facts = _write_bdi(stream, source, memory, progress)
-            else:
-                facts = _write_dfmf(stream, source, components, error, colour_model, scalar, progress)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    finally:
-        Path(name).unlink(missing_ok=True)
+    with new_file(path) as draft, draft.open("wb") as stream:
+        if family == "BDI":
+            facts = _write_bdi(stream, source, memory, progress)
+        else:
+            facts = _write_dfmf(stream, source, components, error, colour_model, scalar, progress)
     return {"format": "bonn", "family": family, **facts, "file_bytes": path.stat().st_size}
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
-import shutil
 import tempfile
 import zipfile
 from pathlib import Path
@@ -16,6 +14,7 @@ from btfref.errors import InputError
 from btfref.formats.image_sets.reader import NOTE
 from btfref.formats.parts import open_parts
 from btfref.images import decoding, radiance
+from btfref.outputs import new_file, new_folder
 
 #: How names are written: pattern of folder and file, and whether it starts with a number.
 _NAMES = {
@@ -80,32 +79,28 @@ def export_images(
         raise InputError("quality of JPEG", field="quality", got=quality, expected="1 to 100")
     angles = {name: _whole_degrees(getattr(source, name), name) for name in ("views", "lights")}
     path, counts = Path(path), {"images": 0, "clipped": 0, "channels": 0, "lights_moved": 0}
-    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".partial", dir=path.absolute().parent))
-    try:
-        with _Sink(temporary, path.suffix.lower() == ".zip", image in ("jpg", "png", "exr")) as sink:
-            note = {"scale": scale * divisor, "cosine_included": with_cosine, "written_by": "btfref"}
-            sink.add(NOTE, json.dumps(note, indent=1).encode())
-            for view, (tv, pv) in enumerate(angles["views"]):
-                values = source.view(view)
-                for light, (tl, pl) in enumerate(angles["lights"]):
-                    where, picture = (tl, pl), values[light].astype(np.float32)
-                    if moved and (tl, pl) == (tv, pv):
-                        where, picture = _moved_light(source, values, where, moved)
-                        counts["lights_moved"] += 1
-                    cosine = 1.0 if with_cosine else max(float(np.cos(np.radians(where[0]))), 1e-6)
-                    picture = picture / np.float32(scale * divisor * cosine)
-                    counts["images"] += 1
-                    folder, file = _NAMES[style]
-                    keys = {"n": counts["images"], "tl": where[0], "pl": where[1], "tv": tv, "pv": pv}
-                    name = f"{folder}/{file}".format(image=image, **keys)
-                    # Row 0 of a picture is its top, v = 1.
-                    sink.add(name, _bytes(picture[::-1], image, encode, planes, quality, counts))
-                if progress is not None:
-                    progress(view + 1, len(angles["views"]), "export")
-            result = sink.finish()
-        os.replace(result, path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    archive = path.suffix.lower() == ".zip"
+    new = new_file if archive else new_folder
+    with new(path) as draft, _Sink(draft, archive, image in ("jpg", "png", "exr")) as sink:
+        note = {"scale": scale * divisor, "cosine_included": with_cosine, "written_by": "btfref"}
+        sink.add(NOTE, json.dumps(note, indent=1).encode())
+        for view, (tv, pv) in enumerate(angles["views"]):
+            values = source.view(view)
+            for light, (tl, pl) in enumerate(angles["lights"]):
+                where, picture = (tl, pl), values[light].astype(np.float32)
+                if moved and (tl, pl) == (tv, pv):
+                    where, picture = _moved_light(source, values, where, moved)
+                    counts["lights_moved"] += 1
+                cosine = 1.0 if with_cosine else max(float(np.cos(np.radians(where[0]))), 1e-6)
+                picture = picture / np.float32(scale * divisor * cosine)
+                counts["images"] += 1
+                folder, file = _NAMES[style]
+                keys = {"n": counts["images"], "tl": where[0], "pl": where[1], "tv": tv, "pv": pv}
+                name = f"{folder}/{file}".format(image=image, **keys)
+                # Row 0 of a picture is its top, v = 1.
+                sink.add(name, _bytes(picture[::-1], image, encode, planes, quality, counts))
+            if progress is not None:
+                progress(view + 1, len(angles["views"]), "export")
     counts["clipped"] /= max(counts.pop("channels"), 1)
     return {"format": style, "pictures": image, "scale": scale, **counts}
 
@@ -160,14 +155,12 @@ def _bytes(values, image, encode, planes, quality, counts):
 
 
 class _Sink:
-    """A folder or archive under a temporary name."""
+    """Files of a folder that is there, or of an archive that is made."""
 
-    def __init__(self, folder, archive, packed):
-        self.target = folder / ("all.zip" if archive else "all")
+    def __init__(self, target, archive, packed):
+        self.target = target
         method = zipfile.ZIP_STORED if packed else zipfile.ZIP_DEFLATED
-        self._zip = zipfile.ZipFile(self.target, "w", method) if archive else None
-        if not archive:
-            self.target.mkdir()
+        self._zip = zipfile.ZipFile(target, "w", method) if archive else None
 
     def __enter__(self):
         return self
@@ -186,8 +179,3 @@ class _Sink:
         target = self.target / name
         target.parent.mkdir(exist_ok=True)
         target.write_bytes(data)
-
-    def finish(self):
-        if self._zip is not None:
-            self._zip.close()
-        return self.target

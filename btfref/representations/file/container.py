@@ -9,14 +9,13 @@ back to it.
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from btfref.conventions import SCHEMA_VERSION
 from btfref.errors import InputError
+from btfref.outputs import new_file
 from btfref.registry import method
 from btfref.representations.file.map_images import (
     channel_names,
@@ -96,17 +95,8 @@ def save(representation, path):
             for i, channel in enumerate(channel_names(image.shape[-1]))
         }
         parts.append(OpenEXR.Part(header, channels, name))
-    if not path.parent.is_dir():
-        raise InputError("the directory does not exist", file=path, got=str(path.parent))
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")
-    os.close(handle)
-    try:
-        OpenEXR.File(parts).write(temporary)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with new_file(path) as draft:
+        OpenEXR.File(parts).write(str(draft))
 
 
 def load(path, *, views=None, lights=None, entries=None, levels=None):

@@ -16,6 +16,7 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.sphere.directions import directions
+from btfref.outputs import new_folder
 from btfref.representations.gbrdf.build import HUE_STEPS, from_maps
 
 SCALARS = "maps.toml"
@@ -73,7 +74,6 @@ def export_maps(representation, out):
     from PIL import Image
 
     from btfref.images.decoding import write_exr
-    from btfref.outputs import new_folder
 
     maps, meta = representation.maps, representation.meta
     if len(maps["ndf"]) > 256:

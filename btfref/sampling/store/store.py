@@ -10,7 +10,7 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.sphere.directions import checked
-from btfref.outputs import refuse_existing
+from btfref.outputs import refuse_existing, require_folder_of
 from btfref.sampling.paths.adaptive import summary
 from btfref.sampling.store.layout import DRAFT, KIND, TILE, attributes_of, check_finite, write_headers
 
@@ -49,8 +49,7 @@ def create_store(
     """
     path = Path(path)
     refuse_existing(path)
-    if not path.absolute().parent.is_dir():
-        raise InputError("no such folder", file=path.parent)
+    require_folder_of(path)
     # A fixed name: what a killed run left is found and removed by the next one.
     draft = path.with_name(path.name + DRAFT)
     shutil.rmtree(draft, ignore_errors=True)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.heightfield import HEIGHT_LIMIT, HeightField
+from btfref.outputs import new_file
 from btfref.representations.gbrdf.build import from_maps
 from btfref.representations.gbrdf.decomposition import heights as height_stage
 from btfref.representations.gbrdf.decomposition.materials import cluster_materials
@@ -202,16 +201,8 @@ def save_stages(stages, path):
     InputError
         When the folder does not exist.
     """
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise InputError("the directory does not exist", file=path, got=str(path.parent))
-    temporary = path.with_name(f".{path.name}.partial")
-    try:
-        with temporary.open("wb") as stream:
-            np.savez(stream, **stages)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with new_file(path) as draft, draft.open("wb") as stream:
+        np.savez(stream, **stages)
 
 
 def _refuse_not_finite(btf):
