@@ -15,6 +15,8 @@ last ring
 
 from __future__ import annotations
 
+from enum import IntEnum
+
 import numpy as np
 
 from btfref.precision import real
@@ -37,6 +39,24 @@ FILTER_TYPES = ("nearest", "bilinear")
 
 #: Coefficients of the luminance of linear Rec. 709 (ITU-R BT.709-6, item 3.2).
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+
+
+class PixelClass(IntEnum):
+    """What a pixel shows, and so what two renderers can be asked to agree on; the codes of class maps.
+
+    *Interior* pixels see one smooth surface, *silhouette* pixels an edge of it, *mesostructure* pixels an edge inside
+    a material that has a geometry of its own, *background* pixels nothing.
+    """
+
+    BACKGROUND = 0
+    INTERIOR = 1
+    SILHOUETTE = 2
+    MESOSTRUCTURE = 3
+
+    @property
+    def label(self) -> str:
+        """The name in gates, tables and results."""
+        return self.name.lower()
 
 
 def luminance(rgb):

@@ -278,7 +278,7 @@ def write_images(image, out, *, png=False, classes=None, classes_out=None):
         save_classes(classes_out, classes)
 
 
-#: Grey levels of a class file per class number, so that a person sees the classes.
+#: Grey levels of a class file in the order of `btfref.conventions.PixelClass`, so that a person sees the classes.
 _CLASS_GREYS = (0, 100, 200, 250)
 
 

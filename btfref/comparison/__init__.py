@@ -1,6 +1,6 @@
 """Image comparison: metrics, statistics, and the error waterfall."""
 
-from btfref.comparison.comparison import CLASSES, Comparison, agreement, compare, json_safe
+from btfref.comparison.comparison import Comparison, agreement, compare, json_safe
 from btfref.images.display import Display
 
-__all__ = ["CLASSES", "Comparison", "Display", "agreement", "compare", "json_safe"]
+__all__ = ["Comparison", "Display", "agreement", "compare", "json_safe"]

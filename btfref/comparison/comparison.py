@@ -9,13 +9,12 @@ import numpy as np
 from btfref.comparison import metrics, significance
 from btfref.comparison.colour import delta_e00
 from btfref.comparison.flip import exposure_range, flip_map
+from btfref.conventions import PixelClass
 from btfref.errors import InputError
 from btfref.gates.tolerances import gate_table, limits, tolerance
 from btfref.gates.verdicts import GateResult, Measured, judge
 from btfref.images.display import fit_display
 
-#: Pixel class → its number in a class map.
-CLASSES = {"background": 0, "interior": 1, "silhouette": 2, "mesostructure": 3}
 CONFIDENCE = 0.99
 
 
@@ -128,10 +127,10 @@ def compare(test, reference, *, classes=None, gate=None, variance=None, display=
     variance = _variance(variance, carried, t.shape)
     keys = (gate,) if isinstance(gate, str) else tuple(gate or ())
     finite = np.isfinite(t).all(-1) & np.isfinite(r).all(-1)
-    masks = {name: finite & (classes == number) for name, number in CLASSES.items()} | {"all": finite}
+    masks = {kind.label: finite & (classes == kind) for kind in PixelClass} | {"all": finite}
     masks = {name: mask for name, mask in masks.items() if mask.any()}
 
-    shown = finite & (classes != CLASSES["background"])
+    shown = finite & (classes != PixelClass.BACKGROUND)
     display = display or fit_display(r, shown)
     clean_t, clean_r = (np.where(finite[..., None], x, 0.0) for x in (t, r))
     peak = float(np.abs(clean_r).max()) or 1.0
@@ -153,9 +152,9 @@ def compare(test, reference, *, classes=None, gate=None, variance=None, display=
             clean_t, clean_r, start=start, stop=stop, exposures=exposures
         )
     relative = np.full(finite.shape, np.nan)
-    for name in CLASSES:
-        if name in masks:
-            mask = masks[name]
+    for kind in PixelClass:
+        if kind.label in masks:
+            mask = masks[kind.label]
             relative[mask] = metrics.relative_error(t[mask], r[mask]).max(-1)
     maps["relative"] = relative
 
@@ -174,7 +173,7 @@ def compare(test, reference, *, classes=None, gate=None, variance=None, display=
             for name, mask in masks.items()
             if (mask & known).any()
         }
-    counts = {name: int(np.count_nonzero(classes == number)) for name, number in CLASSES.items()} | {
+    counts = {kind.label: int(np.count_nonzero(classes == kind)) for kind in PixelClass} | {
         "all": int(classes.size),
         "nonfinite_test": int(np.count_nonzero(~np.isfinite(t).all(-1))),
         "nonfinite_reference": int(np.count_nonzero(~np.isfinite(r).all(-1))),
@@ -257,15 +256,20 @@ def _image(side, name):
     return image, carried
 
 
+def _codes():
+    """Pixel class → its number in a class map."""
+    return {kind.label: kind.value for kind in PixelClass}
+
+
 def _class_map(classes, shape):
     if classes is None:
-        return np.full(shape, CLASSES["interior"], np.uint8)
+        return np.full(shape, PixelClass.INTERIOR, np.uint8)
     classes = np.asarray(classes)
     if classes.shape != shape:
         raise InputError("class map and picture differ", field="classes", got=classes.shape, expected=shape)
-    unknown = sorted(set(np.unique(classes).tolist()) - set(CLASSES.values()))
+    unknown = sorted(set(np.unique(classes).tolist()) - set(PixelClass))
     if unknown:
-        raise InputError("unknown pixel class", field="classes", got=unknown, expected=CLASSES)
+        raise InputError("unknown pixel class", field="classes", got=unknown, expected=_codes())
     return classes.astype(np.uint8)
 
 
@@ -319,9 +323,9 @@ def _class_statistics(t, r, variance, mask, p_values):
 def _judge(key, comparison, masks) -> list[GateResult]:
     """Apply one gate to a comparison of pictures."""
     table = gate_table(key)
-    name = table.get("class", "interior")
+    name = table.get("class", PixelClass.INTERIOR.label)
     wanted = [entry.removeprefix("min_") for entry in limits(table)]
-    if name not in (*CLASSES, "all"):
+    if name not in (*_codes(), "all"):
         raise InputError("unknown pixel class", file="tolerances.toml", field=f"{key}.class", got=name)
     if wanted == ["nonfinite"]:
         bad = {side: comparison.counts[f"nonfinite_{side}"] for side in ("test", "reference")}

@@ -9,7 +9,8 @@ from importlib import resources
 
 import numpy as np
 
-from btfref.comparison.comparison import CLASSES, Comparison, json_safe
+from btfref.comparison.comparison import Comparison, json_safe
+from btfref.conventions import PixelClass
 from btfref.errors import InputError
 from btfref.images.display import Display, fit_display
 
@@ -121,7 +122,7 @@ def signed_difference(comparison):
 
 def full_scale(signed, classes):
     """A round number that 99.9 % of the differences stay below, of the interior where there is one."""
-    inside = np.abs(signed[classes == CLASSES["interior"]])
+    inside = np.abs(signed[classes == PixelClass.INTERIOR])
     size = inside[inside > 0] if inside.any() else np.abs(signed[signed != 0])
     if size.size == 0:
         return 1e-6

@@ -7,6 +7,7 @@ from html import escape
 
 import numpy as np
 
+from btfref.conventions import PixelClass
 from btfref.images.png import encode_png
 from btfref.report import svg
 
@@ -56,7 +57,7 @@ def error_histogram(relative, classes, marks):
     relative : (H, W) array
         Relative error per pixel; NaN is left out.
     classes : (H, W) integer array
-        0 background, 1 interior, 2 silhouette.
+        Codes of `PixelClass`.
     marks : list of (str, float)
         Limits to draw: label and relative error.
 
@@ -68,11 +69,11 @@ def error_histogram(relative, classes, marks):
     low, high = DECADES
     edges = np.linspace(low, high, (high - low) * BINS_PER_DECADE + 1)
     series = []
-    for name, number in (("interior", 1), ("silhouette", 2)):
-        values = relative[(classes == number) & ~np.isnan(relative)]
+    for kind in (PixelClass.INTERIOR, PixelClass.SILHOUETTE):
+        values = relative[(classes == kind) & ~np.isnan(relative)]
         if values.size:
             logs = np.log10(np.clip(values, 10.0**low, 10.0 ** (high - 1e-9)))
-            series.append((name, np.histogram(logs, edges)[0] / values.size))
+            series.append((kind.label, np.histogram(logs, edges)[0] / values.size))
     floor = -5.0  # log10 of the smallest share drawn: one pixel of 316 x 316
 
     def x(log):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from html import escape
 
+from btfref.conventions import PixelClass
 from btfref.report.cell import full_scale, label_of, signed_difference
 from btfref.report.figures import diverging, thumbnail
 from btfref.report.text import badge, limit_name, number
@@ -83,7 +84,7 @@ def _row(index, cell, columns):
         title = escape(f"{gate.sign} {number(gate.limit)}. {gate.detail}")
         sign = {"fail": " ✗", "inconclusive": " ?"}.get(gate.outcome, "")
         values.append(f'<td class="{gate.outcome}" title="{title}">{number(gate.value)}{sign}</td>')
-    measured = (cell.comparison.metrics if cell.comparison else {}).get("interior", {})
+    measured = (cell.comparison.metrics if cell.comparison else {}).get(PixelClass.INTERIOR.label, {})
     values += [f"<td>{number(measured.get(key))}</td>" for key in SHOWN.values()]
     link = f'<a href="#cell-{index}">{_thumbnails(cell)}<span>{escape(cell.name)}</span></a>'
     return f'<tr><th scope="row">{link}</th><td>{badge(cell.outcome)}</td>{"".join(values)}</tr>'

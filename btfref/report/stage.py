@@ -6,6 +6,7 @@ from html import escape
 
 import numpy as np
 
+from btfref.conventions import PixelClass
 from btfref.report.cell import LABELS, asset, full_scale, label_of, script_json, signed_difference
 from btfref.report.figures import error_histogram, p_value_histogram
 from btfref.report.pack import pack
@@ -143,6 +144,6 @@ def _maps(comparison, bits):
 def _charts(comparison, limits):
     charts = [("Relative errors", error_histogram(comparison.maps["relative"], comparison.classes, limits))]
     if "p_value" in comparison.maps:
-        shown = comparison.maps["p_value"][comparison.classes > 0]
+        shown = comparison.maps["p_value"][comparison.classes != PixelClass.BACKGROUND]
         charts.append(("p-values outside the background", p_value_histogram(shown)))
     return charts

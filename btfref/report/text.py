@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from html import escape
 
+from btfref.conventions import PixelClass
+
 OUTCOME = {
     "pass": ("✓", "pass"),
     "fail": ("✗", "fail"),
@@ -92,11 +94,9 @@ def class_table(comparison):
     str
         A ``<table>``.
     """
-    order = [
-        name
-        for name in ("interior", "silhouette", "mesostructure", "background", "all")
-        if name in comparison.metrics
-    ]
+    # What is judged comes first.
+    shown = sorted(PixelClass, key=lambda kind: kind == PixelClass.BACKGROUND)
+    order = [name for name in (*(kind.label for kind in shown), "all") if name in comparison.metrics]
     epsilon = comparison.settings.get("relmse_epsilon")
     head = "".join(f'<th scope="col">{name}</th>' for name in order)
     body = []

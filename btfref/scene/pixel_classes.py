@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from btfref.conventions import PixelClass
 from btfref.scene.camera import film_rays, grid_offsets
 from btfref.scene.loading import loaded
-
-BACKGROUND, INTERIOR, SILHOUETTE, MESOSTRUCTURE = 0, 1, 2, 3
-
-#: Names by value, for reports.
-CLASSES = ("background", "interior", "silhouette", "mesostructure")
 
 #: A step between neighbouring samples that leaves the tangent plane by more than this share of a pixel's
 #: footprint is an edge. A smooth surface of curvature κ leaves it by κ s²/2 (s the distance of the samples),
@@ -60,7 +56,7 @@ def pixel_classes(scene, *, parameters=None, size=None, grid=4, variant="llvm_ad
     Returns
     -------
     ndarray of uint8, shape (H, W)
-        0 background, 1 interior, 2 silhouette, 3 mesostructure.
+        Codes of `PixelClass`.
     """
     with loaded(scene, parameters, variant=variant, size=size) as made:
         shape, point, normal, front, footprint, ambiguous = _hits(made, grid)
@@ -79,8 +75,9 @@ def pixel_classes(scene, *, parameters=None, size=None, grid=4, variant="llvm_ad
     pixels = (shape.shape[0] // grid, grid, shape.shape[1] // grid, grid)
     any_edge = _spread(edge.reshape(pixels).any((1, 3))) | ambiguous.reshape(pixels).any((1, 3))
     any_hit = hit.reshape(pixels).any((1, 3))
-    inner = np.where(jumps, MESOSTRUCTURE, INTERIOR)
-    return np.where(any_edge, SILHOUETTE, np.where(any_hit, inner, BACKGROUND)).astype(np.uint8)
+    inner = np.where(jumps, PixelClass.MESOSTRUCTURE, PixelClass.INTERIOR)
+    seen = np.where(any_hit, inner, PixelClass.BACKGROUND)
+    return np.where(any_edge, PixelClass.SILHOUETTE, seen).astype(np.uint8)
 
 
 def _displaced_edges(scene, grid):

@@ -11,6 +11,7 @@ import numpy as np
 from btfref.comparison import compare, json_safe
 from btfref.comparison.parts import part
 from btfref.comparison.waterfall import Picture, waterfall
+from btfref.conventions import PixelClass
 from btfref.errors import BtfrefError
 from btfref.gates.verdicts import GateResult, missing_reference
 from btfref.images.display import Display, fit_display
@@ -38,7 +39,7 @@ ENVIRONMENT_GATES = {
 }
 
 #: Pixel classes that the waterfall counts: interior, and where the mesostructure's own silhouettes fall.
-COUNTED = (1, 3)
+COUNTED = (PixelClass.INTERIOR, PixelClass.MESOSTRUCTURE)
 
 #: Samples per pixel of a reference under an environment at most.
 MOST = 1 << 15
@@ -161,7 +162,7 @@ def _cell(cache, spec, settings):
     shared = shared_settings(file, spec.lights, settings)
     under = _under_environment if spec.lights in ENVIRONMENTS else _under_deltas
     chain, reference, image, gates, facts, parts = under(path, spec, views, settings, shared)
-    display = fit_display(views.truth.mean(0), views.classes > 0)
+    display = fit_display(views.truth.mean(0), views.classes != PixelClass.BACKGROUND)
     counts = np.isin(views.classes, COUNTED)
     chain = [
         Picture("geometry", views.truth),
@@ -179,7 +180,7 @@ def _cell(cache, spec, settings):
         **vars(spec),
         "gates": [gate.to_dict() for gate in (*comparison.gates, *found.gates)],
         "image_gates": list(gates),
-        "metrics": {name: comparison.metrics.get(name, {}) for name in ("interior", "all")},
+        "metrics": {name: comparison.metrics.get(name, {}) for name in (PixelClass.INTERIOR.label, "all")},
         "waterfall": {
             **found.to_dict(),
             "sampling": sampling_noise(views, counts),
@@ -224,7 +225,9 @@ def _under_environment(path, spec, views, settings, shared):
     image = realtime(path, **shared)
     way = image.meta["environment_path"]
     gates = ENVIRONMENT_GATES[way]
-    reference = converged(path, views.classes == 1, gate=gates, shadows=False, most=MOST, **shared)
+    reference = converged(
+        path, views.classes == PixelClass.INTERIOR, gate=gates, shadows=False, most=MOST, **shared
+    )
     some = np.zeros(views.classes.shape, bool)
     there = np.flatnonzero(np.isin(views.classes, COUNTED))
     rng = np.random.default_rng(settings.seed)

@@ -10,6 +10,7 @@ import numpy as np
 from btfref.comparison import compare
 from btfref.comparison.comparison import agreement
 from btfref.comparison.waterfall import Picture, waterfall
+from btfref.conventions import PixelClass
 from btfref.gates.verdicts import Measured, judge
 from btfref.images.display import fit_display
 from btfref.scene.shipped import scene_file
@@ -108,7 +109,7 @@ class Bench:
         scene, parameters, expected, classes = self.reference(subject)
         image = realtime(scene, parameters=parameters, **SETTINGS).image
         if change == "background":
-            image = np.where(classes[..., None] == 0, image + 0.01, image)
+            image = np.where(classes[..., None] == PixelClass.BACKGROUND, image + 0.01, image)
         return compare(image, expected, classes=classes, gate=GATES, flip=False).gates
 
     def environment(self, subject, change=""):
@@ -125,7 +126,7 @@ class Bench:
         key = subject, "environment"
         if key not in self._references:
             classes = pixel_classes(scene, **shared)
-            found = converged(scene, classes == 1, gate=gates, shadows=False, **shared)
+            found = converged(scene, classes == PixelClass.INTERIOR, gate=gates, shadows=False, **shared)
             self._references[key] = found, classes
         (reference, classes), image = self._references[key], made.image.copy()
         if change == "tile":
@@ -140,17 +141,19 @@ class Bench:
     def batches(self, subject, change=""):
         """A waterfall of one stage from noisy batches; the fault is a batch that is another once more."""
         _, _, expected, classes = self.reference(subject)
-        rng, scale = np.random.default_rng(14), float(expected[classes == 1].mean())
+        rng, scale = np.random.default_rng(14), float(expected[classes == PixelClass.INTERIOR].mean())
         noise = 0.2 * scale * rng.normal(size=(4, *expected.shape))
         if change == "shared":
             noise[1] = noise[0]
         chain = [Picture("truth", expected + noise), Picture("stage", 1.02 * expected[None])]
-        return waterfall(chain, classes == 1, fit_display(expected, classes > 0)).gates
+        return waterfall(
+            chain, classes == PixelClass.INTERIOR, fit_display(expected, classes != PixelClass.BACKGROUND)
+        ).gates
 
     def noisy(self, subject, change=""):
         """A picture against a reference with known noise."""
         _, _, expected, classes = self.reference(subject)
-        rng, scale = np.random.default_rng(15), float(expected[classes == 1].mean())
+        rng, scale = np.random.default_rng(15), float(expected[classes == PixelClass.INTERIOR].mean())
         sigma = 0.01 * scale
         reference = expected + sigma * rng.normal(size=expected.shape)
         image = 1.05 * expected if change == "bright" else expected

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from btfref.comparison import compare
+from btfref.conventions import PixelClass
 from btfref.registry import methods
 from btfref.rendering.offline.approximate import approximate
 from btfref.rendering.offline.exact import render_exact
@@ -69,7 +70,7 @@ def test_a_flat_mesostructure_is_known(made):
         evaluate=lambda uv, w_light, w_view: np.maximum(w_light[:, 2:], 0) * np.ones(3) / np.pi,
     )
     expected = approximate(scene, grid=8, load_file=lambda path: lambert, **shared).image
-    inside = (pixel_classes(scene, grid=2, **shared) == 1) & (expected > 0.05).all(-1)
+    inside = (pixel_classes(scene, grid=2, **shared) == PixelClass.INTERIOR) & (expected > 0.05).all(-1)
     ratio = found.image[inside] / expected[inside]
     # The tile's albedo; jittered samples where the other picture has a grid: smooth shading differs by a little.
     assert 0.05 < np.median(ratio) <= 1
@@ -88,7 +89,7 @@ def test_on_a_plane_it_is_the_path_traced_geometry(made):
     assert bias["low"] <= 0 <= bias["high"]
     error = comparison.statistics["interior"]["rmse_without_noise"]
     assert error["low"] < 0.05 * comparison.metrics["interior"]["mean_reference"]
-    assert (classes == 1).mean() > 0.1
+    assert (classes == PixelClass.INTERIOR).mean() > 0.1
 
 
 def test_same_seed_same_picture(made):

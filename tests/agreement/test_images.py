@@ -6,6 +6,7 @@ from oracle import oracle_btf
 
 from btfref import registry, representations
 from btfref.comparison import compare
+from btfref.conventions import PixelClass
 from btfref.errors import InputError
 from btfref.rendering.gl.renderer import realtime
 from btfref.rendering.offline.reference import render
@@ -127,7 +128,7 @@ def test_lambert_is_mitsubas_diffuse(llvm, tmp_path, monkeypatch, shape, twoside
     plain = scene({"type": "diffuse"})
     expected = render(plain, noise_free=GRID, shadows=False)
     classes = pixel_classes(plain, grid=GRID)
-    assert (expected.image[classes == 1].max(-1) > 0).any()
+    assert (expected.image[classes == PixelClass.INTERIOR].max(-1) > 0).any()
     comparison = compare(
         image, expected, classes=classes, gate=("image.lambert", "image.background"), flip=False
     )
@@ -166,13 +167,15 @@ def test_a_silhouette_is_where_surfaces_meet_the_background(llvm):
     llvm.set_variant("scalar_rgb")
     scene = room(llvm, shapes={"a": {"type": "sphere"}}, lights=LIGHTS, size=(64, 64))
     classes = pixel_classes(scene, grid=2)
-    assert classes[32, 32] == 1
-    assert classes[0, 0] == 0
-    ring = classes == 2
+    assert classes[32, 32] == PixelClass.INTERIOR
+    assert classes[0, 0] == PixelClass.BACKGROUND
+    ring = classes == PixelClass.SILHOUETTE
     # A closed ring: no interior pixel touches the background.
     for axis in (0, 1):
         for step in (1, -1):
-            assert not ((classes == 1) & (np.roll(classes, step, axis) == 0)).any()
+            assert not (
+                (classes == PixelClass.INTERIOR) & (np.roll(classes, step, axis) == PixelClass.BACKGROUND)
+            ).any()
     assert 0.02 < ring.mean() < 0.3
 
 
@@ -197,8 +200,8 @@ def test_a_fold_in_front_of_the_surface_is_a_silhouette(llvm, tmp_path):
     trimesh.Trimesh(sheets, faces, process=False).export(tmp_path / "sheets.ply")
     shape = {"type": "ply", "filename": str(tmp_path / "sheets.ply")}
     classes = pixel_classes(room(llvm, shapes={"a": shape}, lights=LIGHTS, size=(64, 64)), grid=2)
-    assert 0.01 < (classes == 2).mean() < 0.15
-    assert (classes == 0).sum() == 0
+    assert 0.01 < (classes == PixelClass.SILHOUETTE).mean() < 0.15
+    assert (classes == PixelClass.BACKGROUND).sum() == 0
 
 
 def test_realtime_refuses_what_it_cannot_show(llvm):

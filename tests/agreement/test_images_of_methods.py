@@ -6,6 +6,7 @@ import pytest
 from oracle import oracle_btf
 
 from btfref.comparison import compare
+from btfref.conventions import PixelClass
 from btfref.platform import shader_directory
 from btfref.registry import methods
 from btfref.rendering.gl import device
@@ -97,8 +98,8 @@ def assert_same_picture(reference, key, name, lights, settings):
     comparison = compare(image, expected, classes=classes, gate=GATES, flip=False)
     assert comparison.passed, [gate.line for gate in comparison.gates if not gate.passed]
     # The scene fills the picture and is lit: the gates saw something.
-    assert (classes == 1).mean() > 0.2
-    assert (expected.image[classes == 1].max(-1) > 0).mean() > 0.5
+    assert (classes == PixelClass.INTERIOR).mean() > 0.2
+    assert (expected.image[classes == PixelClass.INTERIOR].max(-1) > 0).mean() > 0.5
     assert image.meta["not_finite"] == 0
 
 

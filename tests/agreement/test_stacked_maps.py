@@ -8,6 +8,7 @@ from oracle import oracle_btf
 from probes import hemisphere
 
 from btfref.comparison import compare
+from btfref.conventions import PixelClass
 from btfref.gates.tolerances import tolerance
 from btfref.rendering.gl.renderer import realtime
 from btfref.rendering.offline.reference import render
@@ -93,7 +94,7 @@ def both_pictures(mi, fitted, folder, **parameters):
     """The plane with a representation, by the reference and in real time."""
     save(fitted, folder / "a.cmf.exr")
     scene = plane(mi, {"type": "btf", "filename": str(folder / "a.cmf.exr"), **parameters})
-    assert (pixel_classes(scene, grid=GRID) == 1).all()
+    assert (pixel_classes(scene, grid=GRID) == PixelClass.INTERIOR).all()
     return render(scene, noise_free=GRID, shadows=False), realtime(scene, grid=GRID)
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from btfref.comparison import compare
 from btfref.comparison.significance import tile_equivalence, tile_half_widths
+from btfref.conventions import PixelClass
 from btfref.gates.tolerances import tolerance
 from btfref.registry import methods
 from btfref.rendering.gl.renderer import realtime
@@ -58,7 +59,7 @@ def compared(path, scene, environment, gates, *, size=(24, 24), way="auto", **op
     file = scene_file(scene)
     image = realtime(file, environment=way, **options, **settings)
     classes = pixel_classes(file, **settings)
-    reference = converged(file, classes == 1, gate=gates, shadows=False, **settings)
+    reference = converged(file, classes == PixelClass.INTERIOR, gate=gates, shadows=False, **settings)
     if reference.meta["noise_ratio"] > 1:
         # Not an AssertionError: an undecided cell is no known miss.
         pytest.fail("the reference is too noisy to tell")
@@ -89,7 +90,7 @@ def test_the_reference_without_shadows_is_unbiased(fits):
     file = scene_file("bowl")
     # Order 1 of spherical harmonics is exact here.
     exact = realtime(file, environment="sh", order=1, **settings)
-    inside = pixel_classes(file, **settings) == 1
+    inside = pixel_classes(file, **settings) == PixelClass.INTERIOR
     plain = render(file, spp=1024, seed=3, shadows=False, **settings)
     found = compare(
         exact, plain, classes=inside.astype(np.uint8), gate="image.environment_lights", flip=False

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from btfref.comparison.significance import bias_interval, difference_test, welch_test
+from btfref.conventions import PixelClass
 from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
 from btfref.mesostructure import build
 from btfref.numerics.sphere.directions import directions
-from btfref.rendering.offline.geometry import BACKGROUND, INTERIOR, geometry_classes, render_geometry
+from btfref.rendering.offline.geometry import geometry_classes, render_geometry
 from btfref.sampling.synthesis import synthesize
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -64,10 +65,10 @@ def test_flat_tile_is_lambertian(llvm, files):
     result = render_geometry(scene, spp=8)
     classes = geometry_classes(scene)
     expected = 0.4 / np.pi / np.hypot(0.3, 1.0) * np.array([2.0, 1.5, 1.0])
-    assert (classes == INTERIOR).mean() > 0.1
-    error = np.abs(result.image[classes == INTERIOR] / expected - 1)
+    assert (classes == PixelClass.INTERIOR).mean() > 0.1
+    error = np.abs(result.image[classes == PixelClass.INTERIOR] / expected - 1)
     assert error.max() <= tolerance("geometry.flat")
-    assert not result.image[classes == BACKGROUND].any()
+    assert not result.image[classes == PixelClass.BACKGROUND].any()
     assert result.meta["mesostructure"]["name"] == "flat"
 
 
@@ -122,9 +123,9 @@ def test_interior_keeps_away_from_the_border(llvm, files):
     scene = _scene(llvm, files / "checker.raw.exr", tiles=4.0)
     shallow = geometry_classes(scene, mesostructure=build("checker", resolution=32, amplitude=0.05))
     deep = geometry_classes(scene, mesostructure=build("checker", resolution=32, amplitude=0.4))
-    assert 0 < (deep == INTERIOR).sum() < (shallow == INTERIOR).sum()
-    assert (shallow[deep == INTERIOR] == INTERIOR).all()
-    assert ((shallow == BACKGROUND) == (deep == BACKGROUND)).all()
+    assert 0 < (deep == PixelClass.INTERIOR).sum() < (shallow == PixelClass.INTERIOR).sum()
+    assert (shallow[deep == PixelClass.INTERIOR] == PixelClass.INTERIOR).all()
+    assert ((shallow == PixelClass.BACKGROUND) == (deep == PixelClass.BACKGROUND)).all()
 
 
 @pytest.mark.parametrize(

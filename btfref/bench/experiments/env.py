@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from btfref.bench.timing import machine
+from btfref.conventions import PixelClass
 from btfref.scene.shipped import scene_file
 
 #: Pictures are small: the noise of their references averages out over the sphere.
@@ -82,7 +83,7 @@ def _scene(path, scene, environment):
 def _inside(file, settings):
     from btfref.scene.pixel_classes import pixel_classes
 
-    return pixel_classes(file, **settings) == 1
+    return pixel_classes(file, **settings) == PixelClass.INTERIOR
 
 
 def _error(image, reference, inside):

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from btfref.conventions import PixelClass
 from btfref.errors import InputError
 from btfref.rendering.result import RenderResult
 from btfref.scene.description import read_scene
@@ -21,9 +22,6 @@ ROUNDS = 16
 #: near the border are set apart: of cosine-distributed rays that rise by the depth, 1 in 5 comes from beyond
 #: 2 depths, and that light is a small share of a small share.
 INDIRECT_REACH = 2.0
-
-#: Codes of pixel classes, as everywhere in btfref.
-BACKGROUND, INTERIOR, BORDER = 0, 1, 2
 
 #: Relative slack within which a surface counts as flat and its texture axes as equal and at right angles.
 _SLACK = 1e-4
@@ -197,9 +195,9 @@ def geometry_classes(scene, *, parameters=None, mesostructure=None, size=None, g
         blocks = mask.reshape(camera.height, grid + 1, camera.width, grid + 1)
         return reduce(blocks, axis=(1, 3))
 
-    classes = np.full((camera.height, camera.width), BORDER, np.uint8)
-    classes[~per_pixel(hit, np.any)] = BACKGROUND
-    classes[per_pixel(inner, np.all)] = INTERIOR
+    classes = np.full((camera.height, camera.width), PixelClass.SILHOUETTE, np.uint8)
+    classes[~per_pixel(hit, np.any)] = PixelClass.BACKGROUND
+    classes[per_pixel(inner, np.all)] = PixelClass.INTERIOR
     return classes
 
 

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from btfref.conventions import PixelClass
 from btfref.gates.tolerances import tolerance
 from btfref.numerics.sphere.quadrature import gauss_hemisphere
 from btfref.registry import methods
@@ -79,7 +80,7 @@ def test_a_constant_environment_shows_the_albedo(fits, monkeypatch, key, scene):
         lambda *_, **__: Prepared("lights", "", {}, partial(albedo, EVERY[scene], nodes)),
     )
     exact = approximate(file, path="lights", **settings).image
-    inside = (pixel_classes(file, **settings) == 1) & np.isfinite(exact).all(-1)
+    inside = (pixel_classes(file, **settings) == PixelClass.INTERIOR) & np.isfinite(exact).all(-1)
     assert inside.sum() > 8
     assert exact[inside].min() > 0
     difference = np.abs(image.image - exact)[inside].max()

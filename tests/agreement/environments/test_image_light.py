@@ -10,6 +10,7 @@ from probes import hemisphere
 from btfref.cli import main
 from btfref.comparison import compare
 from btfref.comparison.comparison import agreement
+from btfref.conventions import PixelClass
 from btfref.gates.tolerances import tolerance
 from btfref.images import save_image
 from btfref.platform import shader_directory
@@ -163,7 +164,7 @@ def test_pictures_equal_float64(under_sky, fits, tables, monkeypatch, key):
     image = realtime(read_scene(SPHERE, parameters, size=SIZE), grid=1)
     assert image.meta["environment"] == "envmap"
     assert image.meta["environment_path"] == "prefiltered"
-    assert (image.image[classes == 1].max(-1) > 0.01).all()
+    assert (image.image[classes == PixelClass.INTERIOR].max(-1) > 0.01).all()
     exact = approximate(SPHERE, parameters=parameters, grid=1, size=SIZE)
     found = compare(image, exact, classes=classes, gate="image.float64", flip=False)
     assert found.passed, [gate.line for gate in found.gates]
@@ -184,7 +185,7 @@ def test_pictures_are_near_the_path_tracer(under_sky, key):
     parameters = under_sky(key)
     image = realtime(read_scene(SPHERE, parameters, size=SIZE), grid=4)
     classes = pixel_classes(SPHERE, parameters=parameters, grid=4, size=SIZE)
-    inside = classes == 1
+    inside = classes == PixelClass.INTERIOR
     spp = 256
     while True:
         reference = render(SPHERE, parameters=parameters, spp=spp, seed=1, size=SIZE, with_variance=True)

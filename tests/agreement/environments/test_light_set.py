@@ -5,6 +5,7 @@ import pytest
 
 from btfref.comparison import compare
 from btfref.comparison.comparison import agreement
+from btfref.conventions import PixelClass
 from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
 from btfref.images import save_image
@@ -83,7 +84,7 @@ def test_pictures_equal_float64(need, fits, tmp_path, key):
     classes = pixel_classes(scene_file("cloth"), **settings)
     found = compare(image, exact, classes=classes, gate="image.float64", flip=False)
     assert found.passed, [gate.line for gate in found.gates]
-    assert image.image[classes == 1].mean() > 0.01
+    assert image.image[classes == PixelClass.INTERIOR].mean() > 0.01
 
 
 def test_thousands_of_lights_are_all_drawn(need, fits):
@@ -95,7 +96,7 @@ def test_thousands_of_lights_are_all_drawn(need, fits):
     settings = {"parameters": parameters, "grid": 1, "size": (8, 8)}
     image = realtime(scene_file("sphere"), environment="lights", lights=4096, **settings).image
     exact = approximate(scene_file("sphere"), path="sh", order=1, **settings).image
-    inside = pixel_classes(scene_file("sphere"), **settings) == 1
+    inside = pixel_classes(scene_file("sphere"), **settings) == PixelClass.INTERIOR
     difference = np.abs(image - exact)[inside].max()
     assert difference <= tolerance("environment.furnace.max") * exact[inside].max()
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from btfref.comparison import compare
+from btfref.conventions import PixelClass
 from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
 from btfref.numerics.sphere import harmonics
@@ -103,7 +104,7 @@ def test_large_scale_shadows(fits):
     """A bowl against the path tracer that hides the sky by the bowl, with shadows in the matrices and without."""
     file, own = scene_file("bowl"), parameters(fits)
     settings = {"parameters": own, "size": SIZE, "grid": 1}
-    inside = pixel_classes(file, **settings) == 1
+    inside = pixel_classes(file, **settings) == PixelClass.INTERIOR
     reference = render(file, spp=1024, seed=2, **settings)
     noise = np.mean(reference.variance[inside])
 
@@ -122,7 +123,7 @@ def test_light_from_wall_to_wall(fits):
     file = scene_file("bowl")
     settings = {"size": SIZE, "parameters": parameters(fits)}
     deeper = settings | {"parameters": parameters(fits, depth="3")}
-    inside = pixel_classes(file, grid=2, **settings) == 1
+    inside = pixel_classes(file, grid=2, **settings) == PixelClass.INTERIOR
     reference = render(file, spp=512, seed=2, **deeper).image[inside].mean(0)
 
     def mean(bounces):

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from btfref.comparison import Comparison, Display, agreement, compare
+from btfref.conventions import PixelClass
 from btfref.errors import InputError
 from btfref.gates import gate_table, judge, missing_reference, reason, tolerance
 from btfref.gates.tolerances import gate_keys, limits, parse
 
 ROOT = Path(__file__).parents[3]
-INTERIOR, SILHOUETTE = 1, 2
 
 
 @pytest.fixture
@@ -24,9 +24,11 @@ def scene(rng):
     """A disc on a black background: reference and class map."""
     y, x = np.mgrid[0:64, 0:64] - 31.5
     radius = np.hypot(x, y)
-    classes = np.where(radius < 24, INTERIOR, np.where(radius < 25.5, SILHOUETTE, 0)).astype(np.uint8)
+    classes = np.full(radius.shape, PixelClass.BACKGROUND, np.uint8)
+    classes[radius < 25.5] = PixelClass.SILHOUETTE
+    classes[radius < 24] = PixelClass.INTERIOR
     texture = 0.2 + 0.15 * np.sin(x / 3)[..., None] * np.cos(y[..., None] / [2, 3, 5])
-    return np.where((classes > 0)[..., None], texture, 0.0).astype(np.float32), classes
+    return np.where((classes != PixelClass.BACKGROUND)[..., None], texture, 0.0).astype(np.float32), classes
 
 
 def names(results, outcome="fail"):
@@ -52,7 +54,7 @@ def test_equal_pictures_pass_every_class(scene):
 def test_each_class_has_its_own_errors(scene):
     reference, classes = scene
     test = reference.copy()
-    test[classes == SILHOUETTE] += 0.1
+    test[classes == PixelClass.SILHOUETTE] += 0.1
     found = compare(test, reference, classes=classes, gate=["image.noise_free", "image.silhouette"])
     assert found.metrics["interior"]["max_abs"] == 0
     assert found.metrics["silhouette"]["bias"] == pytest.approx(0.1, rel=tolerance("metric.float32.rtol"))

@@ -3,12 +3,14 @@
 import io
 import json
 import re
+from importlib.resources import files
 
 import numpy as np
 import pytest
 from browser import browse
 
 from btfref.comparison import compare
+from btfref.conventions import PixelClass
 from btfref.errors import InputError
 from btfref.gates import GateResult, missing_reference, reason, tolerance
 from btfref.images.png import encode_png
@@ -28,8 +30,11 @@ def pictures(rng, size=24):
     """Reference, test and truth of a disc, and its class map."""
     y, x = np.mgrid[0:size, 0:size] - (size - 1) / 2
     radius = np.hypot(x, y) / size
-    classes = np.where(radius < 0.38, 1, np.where(radius < 0.43, 2, 0)).astype(np.uint8)
-    reference = np.where(classes[..., None] > 0, 0.3 + 0.2 * np.sin(x[..., None] / [1.0, 2.0, 3.0]), 0.0)
+    classes = np.full(radius.shape, PixelClass.BACKGROUND, np.uint8)
+    classes[radius < 0.43] = PixelClass.SILHOUETTE
+    classes[radius < 0.38] = PixelClass.INTERIOR
+    hit = (classes != PixelClass.BACKGROUND)[..., None]
+    reference = np.where(hit, 0.3 + 0.2 * np.sin(x[..., None] / [1.0, 2.0, 3.0]), 0.0)
     test = reference * (1 + 1e-5 * rng.standard_normal(reference.shape))
     return reference, test, reference * 1.02, classes
 
@@ -50,6 +55,12 @@ def cells(rng):
 
 
 # --- packing ----------------------------------------------------------------------------------------------
+
+
+def test_the_page_names_pixel_classes_in_their_order():
+    script = (files("btfref.report") / "assets" / "report.js").read_text("utf-8")
+    table = script.split("const CLASSES = ")[1].split(";")[0]
+    assert re.findall(r'"(\w+)"', table) == [kind.label for kind in PixelClass]
 
 
 @pytest.mark.parametrize(("bits", "key"), [(8, "report.packing.pictures"), (6, "report.packing.maps")])

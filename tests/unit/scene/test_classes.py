@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from btfref.scene.pixel_classes import INTERIOR, SILHOUETTE, pixel_classes
+from btfref.conventions import PixelClass
+from btfref.scene.pixel_classes import pixel_classes
 
 #: A square in two triangles, larger than the picture; its diagonal runs through the picture's corners.
 CORNERS = ((-2, -2), (2, -2), (2, 2), (-2, 2))
@@ -41,6 +42,8 @@ def test_samples_on_an_edge_between_tangent_frames_are_ambiguous(fourth, turned,
     write_square(tmp_path / "square.ply", [(0, 0), (1, 0), (1, 1), fourth])
     classes = classes_of(llvm, tmp_path / "square.ply")
     # World x and y run to the left and up, so that the diagonal y = x falls from left to right.
-    diagonal = np.eye(16, dtype=bool)[:, ::-1] if classes[0, -1] == SILHOUETTE else np.eye(16, dtype=bool)
-    assert (classes[~diagonal] == INTERIOR).all()
-    assert (classes[diagonal] == (SILHOUETTE if turned else INTERIOR)).all()
+    diagonal = (
+        np.eye(16, dtype=bool)[:, ::-1] if classes[0, -1] == PixelClass.SILHOUETTE else np.eye(16, dtype=bool)
+    )
+    assert (classes[~diagonal] == PixelClass.INTERIOR).all()
+    assert (classes[diagonal] == (PixelClass.SILHOUETTE if turned else PixelClass.INTERIOR)).all()

@@ -12,6 +12,7 @@ from schemas import assert_follows_schema
 
 from btfref import provenance as caching
 from btfref.comparison.waterfall import Picture, waterfall
+from btfref.conventions import PixelClass
 from btfref.errors import InputError
 from btfref.images.display import Display
 from btfref.provenance import code_of, method_files
@@ -116,19 +117,20 @@ def test_a_picture_that_is_nearly_another_costs_little(rng):
 def result(rng):
     """A validation of two cells with made pictures."""
     cells, size = [], 24
-    classes = np.ones((size, size), np.uint8)
-    classes[:3], classes[3] = 0, 2
+    classes = np.full((size, size), PixelClass.INTERIOR, np.uint8)
+    classes[:3], classes[3] = PixelClass.BACKGROUND, PixelClass.SILHOUETTE
+    hit = (classes != PixelClass.BACKGROUND)[..., None]
     for key in ("lpca", "svd"):
-        reference = rng.uniform(0.1, 0.9, (size, size, 3)).astype(np.float32) * (classes > 0)[..., None]
+        reference = rng.uniform(0.1, 0.9, (size, size, 3)).astype(np.float32) * hit
         image = (reference * (1 + 1e-6 * rng.normal(size=reference.shape))).astype(np.float32)
-        truth = reference + 0.02 * rng.normal(size=(4, *reference.shape)) * (classes > 0)[..., None]
+        truth = reference + 0.02 * rng.normal(size=(4, *reference.shape)) * hit
         chain = [("geometry", truth), ("sampled BTF", reference[None] * 1.01), ("fit", reference[None])]
         chain += [
             ("port", reference[None]),
             ("real time", image[None]),
             ("8 bits", eight_bits(image, Display())[None]),
         ]
-        fall = waterfall([Picture(*c) for c in chain], classes == 1, Display())
+        fall = waterfall([Picture(*c) for c in chain], classes == PixelClass.INTERIOR, Display())
         spec = Spec("checker", key, "sphere", "points2")
         images = {"truth": truth.mean(0).astype(np.float32), "reference": reference, "realtime": image}
         facts = {
