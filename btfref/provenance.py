@@ -80,7 +80,7 @@ def code_of(stage, method=None):
     ----------
     stage : {"material", "fit", "picture"}
     method : str, optional
-        Registry key: its three files count, those of other methods never do.
+        Registry key: its three files count, and for pictures its limits; those of other methods never do.
 
     Returns
     -------
@@ -91,11 +91,15 @@ def code_of(stage, method=None):
 
     from btfref.registry import methods
 
-    owned = {path for row in methods().values() for path in method_files(row)}
+    rows = methods()
+    limits = {key: [row.tolerances.resolve()] if row.tolerances else [] for key, row in rows.items()}
+    owned = {path for key, row in rows.items() for path in (*method_files(row), *limits[key])}
     stages = (*BEFORE[stage], stage)
     files = [path for name in stages for place in CODE[name] for path in _files(place) if path not in owned]
     if method is not None:
-        files += method_files(methods()[method])
+        files += method_files(rows[method])
+        if stage == "picture":  # a limit decides a verdict, and no fit
+            files += [path for path in limits[method] if path.is_file()]
     digest = hashlib.sha256()
     for path in sorted(set(files)):
         digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
 
 from btfref.errors import InputError
 
@@ -80,6 +82,17 @@ class Method:
     def presets(self):
         """Named settings of ``fit``; "paper" has the settings of the method's paper."""
         return import_module(self.fit_module or self.module).PRESETS
+
+    @property
+    def tolerances(self) -> Path | None:
+        """Where the method's own limits stand, if it has any: ``tolerances.toml`` beside its module.
+
+        None for a module that is in no package. Nothing of the method is imported.
+        """
+        top, *inner = self.module.split(".")[:-1] or [""]
+        spec = find_spec(top) if top else None
+        roots = spec.submodule_search_locations if spec else None
+        return Path(roots[0], *inner, "tolerances.toml") if roots else None
 
     @property
     def editor(self):

@@ -1,4 +1,9 @@
-"""The limits of gates and tests, read from ``tolerances.toml``, where each has its reason."""
+"""The limits of gates and tests, read from ``tolerances.toml``, where each has its reason.
+
+The file beside this module holds what methods share. A method brings what concerns it alone in a ``tolerances.toml``
+beside its own module (`btfref.registry.Method.tolerances`): gates of its own, and ``[GATE.METHOD]`` with limits that it
+has instead of those of a shared gate (`tolerance_of`).
+"""
 
 from __future__ import annotations
 
@@ -6,9 +11,13 @@ import copy
 import difflib
 import functools
 import tomllib
+from collections.abc import Mapping
 from importlib import resources
+from typing import Any
 
 from btfref.errors import InputError
+from btfref.registry import methods
+from btfref.types import PathLike
 
 #: Entries of a gate that steer its test and are no limits.
 PARAMETERS = (
@@ -23,8 +32,11 @@ PARAMETERS = (
     "rtol",
 )
 
+#: Entries of a gate: limits and settings by name, and the ``reason``.
+Gate = dict[str, Any]
 
-def parse(text, *, file="tolerances.toml"):
+
+def parse(text: str, *, file: PathLike = "tolerances.toml") -> dict[str, Gate]:
     """Gates of a TOML text, flattened to dotted keys.
 
     Parameters
@@ -48,9 +60,9 @@ def parse(text, *, file="tolerances.toml"):
         tree = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(str(error), file=file) from error
-    gates = {}
+    gates: dict[str, Gate] = {}
 
-    def walk(prefix, table):
+    def walk(prefix: str, table: dict[str, Any]) -> None:
         leaves = {name: value for name, value in table.items() if not isinstance(value, dict)}
         if leaves:
             if not str(leaves.get("reason", "")).strip():
@@ -70,16 +82,27 @@ def parse(text, *, file="tolerances.toml"):
 
 
 @functools.cache
-def _shipped():
-    return parse(resources.files("btfref.gates").joinpath("tolerances.toml").read_text("utf-8"))
+def _gates() -> dict[str, Gate]:
+    """All gates: the shared ones, then those of the methods."""
+    gates = parse(resources.files("btfref.gates").joinpath("tolerances.toml").read_text("utf-8"))
+    # A dict, since methods that share a folder share its file.
+    files = dict.fromkeys(row.tolerances for row in methods().values())
+    for file in files:
+        if file is None or not file.is_file():
+            continue
+        own = parse(file.read_text("utf-8"), file=file)
+        if twice := sorted(own.keys() & gates.keys()):
+            raise InputError("gates that are there already", file=file, got=", ".join(twice))
+        gates |= own
+    return gates
 
 
-def gate_keys():
-    """Keys of all gates, in the order of the file."""
-    return tuple(_shipped())
+def gate_keys() -> tuple[str, ...]:
+    """Keys of all gates, the shared ones first, in the order of the files."""
+    return tuple(_gates())
 
 
-def gate_table(key):
+def gate_table(key: str) -> Gate:
     """A copy of the entries of one gate.
 
     Parameters
@@ -96,7 +119,7 @@ def gate_table(key):
     InputError
         Unknown key.
     """
-    gates = _shipped()
+    gates = _gates()
     if key not in gates:
         # Not all of them: the message stays a line.
         like = difflib.get_close_matches(key, gates, n=5, cutoff=0.4) or [
@@ -108,7 +131,7 @@ def gate_table(key):
     return copy.deepcopy(gates[key])
 
 
-def limits(table):
+def limits(table: Mapping[str, object]) -> dict[str, float]:
     """The upper and lower limits among the entries of a gate, in their order.
 
     Parameters
@@ -131,7 +154,7 @@ def limits(table):
     }
 
 
-def tolerance(key):
+def tolerance(key: str) -> float:
     """One number of ``tolerances.toml``.
 
     Parameters
@@ -148,7 +171,7 @@ def tolerance(key):
     InputError
         Unknown key, an entry that is not a number, or a gate alone with several numbers.
     """
-    gates = _shipped()
+    gates = _gates()
     if key in gates:
         numbers = {
             name: value
@@ -169,7 +192,31 @@ def tolerance(key):
     return float(value)
 
 
-def reason(key):
+def tolerance_of(method: str, key: str) -> float:
+    """One number as it holds for a method: its own where it brings one, else the shared one.
+
+    Parameters
+    ----------
+    method : str
+        Key of the method.
+    key : str
+        ``"gate.entry"`` of a shared gate; the method's own limit is ``entry`` of the gate ``gate.method``.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    InputError
+        As `tolerance`.
+    """
+    gate, _, entry = key.rpartition(".")
+    own = f"{gate}.{method}"
+    return tolerance(f"{own}.{entry}" if entry in _gates().get(own, {}) else key)
+
+
+def reason(key: str) -> str:
     """Why the limits of a gate are what they are.
 
     Parameters
@@ -181,5 +228,5 @@ def reason(key):
     -------
     str
     """
-    gates = _shipped()
-    return gates[key]["reason"] if key in gates else gate_table(key.rpartition(".")[0])["reason"]
+    gates = _gates()
+    return str((gates[key] if key in gates else gate_table(key.rpartition(".")[0]))["reason"])

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from btfref.errors import InputError
 from btfref.gates.tolerances import gate_table, limits
+from btfref.types import Facts
 
 
 @dataclass(frozen=True)
@@ -42,29 +44,29 @@ class GateResult:
     detail: str = ""
 
     @property
-    def gate(self):
+    def gate(self) -> str:
         """The gate's key, ``"image.noise_free"``."""
         return self.name.rpartition(".")[0]
 
     @property
-    def entry(self):
+    def entry(self) -> str:
         """The entry within the gate, ``"p999"``."""
         return self.name.rpartition(".")[2]
 
     @property
-    def sign(self):
+    def sign(self) -> str:
         """Relation that the value must have to the limit."""
         return "≥" if self.entry.startswith("min_") else "≤"
 
     @property
-    def line(self):
+    def line(self) -> str:
         """The result in one line, for a terminal or a test's message."""
         where = f" [{self.pixel_class}]" if self.pixel_class else ""
         value = "no value" if self.value is None else f"{self.value:.4g}"
         detail = f" ({self.detail})" if self.detail else ""
         return f"{self.outcome}: {self.name}{where} {value}, wanted {self.sign} {self.limit:g}{detail}"
 
-    def to_dict(self):
+    def to_dict(self) -> Facts:
         """JSON-able form."""
         return {
             "name": self.name,
@@ -95,14 +97,16 @@ class Measured:
     detail: str = ""
 
 
-def judge(key, measured, *, pixel_class=""):
+def judge(
+    key: str, measured: Mapping[str, float | Measured | None], *, pixel_class: str = ""
+) -> list[GateResult]:
     """Apply every limit of a gate.
 
     Parameters
     ----------
     key : str
         Gate in ``tolerances.toml``.
-    measured : dict of str to float or Measured
+    measured : dict of str to float, Measured or None
         One number for every limit, under the limit's name without ``min_``. A number that is missing, None or
         NaN fails its gate: what was not measured is not right.
     pixel_class : str, optional
@@ -134,7 +138,7 @@ def judge(key, measured, *, pixel_class=""):
     ]
 
 
-def missing_reference(key, what):
+def missing_reference(key: str, what: str) -> list[GateResult]:
     """The results of a gate whose reference is not there: failures.
 
     Parameters
@@ -152,7 +156,9 @@ def missing_reference(key, what):
     return judge(key, dict.fromkeys(names, Measured(None, "fail", f"missing reference: {what}")))
 
 
-def _apply(name, measured, limit, reason, pixel_class):
+def _apply(
+    name: str, measured: float | Measured | None, limit: float, reason: str, pixel_class: str
+) -> GateResult:
     if not isinstance(measured, Measured):
         measured = Measured(measured)
     value = None if measured.value is None else float(measured.value)

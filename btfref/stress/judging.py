@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from btfref.gates.tolerances import gate_table, tolerance
+from btfref.gates.tolerances import tolerance, tolerance_of
 
 #: Random points of the box of rounded arguments among which a differing value is looked for.
 NEIGHBOURS = 256
@@ -61,13 +61,8 @@ class Finding:
 
 
 def limit_finding(check, method, data, worst, key, *, evaluator="definition", cases=1, where="", detail=None):
-    """A finding of one number with an upper limit in ``tolerances.toml``; NaN fails.
-
-    A limit of the method's own stands beside the common one, with its key at the end of the name.
-    """
-    gate, _, name = key.rpartition(".")
-    own = f"{name}_{method}"
-    bound = tolerance(f"{gate}.{own}" if own in gate_table(gate) else key)
+    """A finding of one number with an upper limit in ``tolerances.toml``, the method's own if it has one; NaN fails."""
+    bound = tolerance_of(method, key)
     return Finding(
         check,
         method,

@@ -16,7 +16,7 @@ from btfref.conventions import PixelClass
 from btfref.errors import InputError
 from btfref.images.display import Display
 from btfref.provenance import code_of, method_files
-from btfref.registry import methods
+from btfref.registry import Method, methods
 from btfref.report.pack import pack, unpack, unpack_text
 from btfref.report.validation import write_validation
 from btfref.validate.cache import Cache
@@ -71,6 +71,29 @@ def test_keys_follow_what_a_result_depends_on(tmp_path, monkeypatch):
     code_of.cache_clear()
     assert after["svd"] != before["svd"]
     assert after["lpca"] == before["lpca"]
+
+
+def test_limits_of_a_method_decide_its_pictures_and_no_fit(tmp_path, monkeypatch):
+    def keys():
+        code_of.cache_clear()
+        return {(stage, key): code_of(stage, key) for stage in ("fit", "picture") for key in ("gbrdf", "svd")}
+
+    before, shipped = keys(), Method.tolerances.fget
+    changed = tmp_path / "tolerances.toml"
+    changed.write_text(shipped(methods()["gbrdf"]).read_text("utf-8").replace("0.33", "0.34"), "utf-8")
+    monkeypatch.setattr(
+        Method, "tolerances", property(lambda row: changed if row.key == "gbrdf" else shipped(row))
+    )
+    monkeypatch.setattr(
+        caching,
+        "_files",
+        lambda place, files=caching._files: [
+            p for p in files(place) if p != shipped(methods()["gbrdf"]).resolve()
+        ],
+    )
+    after = keys()
+    code_of.cache_clear()
+    assert {place for place in before if before[place] != after[place]} == {("picture", "gbrdf")}
 
 
 def test_results_appear_whole_or_not_at_all(tmp_path):
