@@ -60,28 +60,19 @@ class Method:
         return import_module(self.module).Representation
 
     @property
-    def fit(self):
-        """``fit(btf, *, seed=0, progress=None, **params) -> Representation``."""
-        return import_module(self.fit_module or self.module).fit
+    def fitting(self):
+        """The module that makes representations: a :class:`btfref.representations.protocol.FitModule`."""
+        return import_module(self.fit_module or self.module)
 
     @property
-    def fit_partial(self):
-        """``fit_partial(store, **params) -> Representation`` of what is there of a store that was filled in part.
-
-        Raises
-        ------
-        InputError
-            For a method that needs the whole.
-        """
-        found = getattr(import_module(self.module), "fit_partial", None)
-        if found is None:
-            raise InputError("the method needs the whole BTF", field="--partial", got=self.key)
-        return found
+    def fit(self):
+        """``fit(btf, *, seed=0, progress=None, **params) -> Representation``."""
+        return self.fitting.fit
 
     @property
     def presets(self):
         """Named settings of ``fit``; "paper" has the settings of the method's paper."""
-        return import_module(self.fit_module or self.module).PRESETS
+        return self.fitting.PRESETS
 
     @property
     def tolerances(self) -> Path | None:

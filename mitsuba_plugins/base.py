@@ -21,6 +21,7 @@ from mitsuba_plugins.lib.guide import LightGuide
 from mitsuba_plugins.lib.lookup import direction_table, valid_directions
 from mitsuba_plugins.lib.proposals import Guided, Mixture
 from mitsuba_plugins.lib.tables import tensor
+from mitsuba_plugins.protocol import Displaced, LevelledEvaluator, Proposes
 
 
 class Maps:
@@ -149,12 +150,11 @@ def make_bsdf():
 
         def _share_of_own_lobes(self, props):
             """Share of the method's own proposal in [0, 1], beside the guide; −1: neither."""
-            shares = {"data": 0.0, "cosine": -1.0}
-            if hasattr(self.evaluator, "proposal"):
+            shares, default = {"data": 0.0, "cosine": -1.0}, "data"
+            if isinstance(self.evaluator, Proposes):
                 shares |= {"lobes": 1.0, "both": 0.5}
-            return shares[
-                _choice(props, "sampling", getattr(self.evaluator, "sampling", "data"), tuple(shares))
-            ]
+                default = self.evaluator.sampling
+            return shares[_choice(props, "sampling", default, tuple(shares))]
 
         def _level_of_detail(self, props):
             """What chooses λ, or None for a method without levels; parameters are checked either way."""
@@ -163,7 +163,7 @@ def make_bsdf():
             unit = _number(props, "lod_unit", 1.0, positive=True)
             angle = _number(props, "pixel_angle", 0.0, least=0.0)
             camera = _parameter(props, "camera", None)
-            if not hasattr(self.evaluator, "max_lod"):
+            if not isinstance(self.evaluator, LevelledEvaluator):
                 return None
             return LevelOfDetail(mode, bias, unit, angle, camera, self.affine, self.maps.shape)
 
@@ -204,7 +204,7 @@ def make_bsdf():
             uv = self._uv(si)
             known = {} if self.detail is None else self.detail(si)
             place = uv
-            if hasattr(self.evaluator, "hit"):
+            if isinstance(self.evaluator, Displaced):
                 hit, place = self.evaluator.hit(uv, w_view, active)
                 known = known | {"hit": hit}
             if self.own_share > 0:
@@ -284,7 +284,7 @@ def make_bsdf():
         def to_string(self):
             return (
                 f"BTF[filename={self.filename}, method={self.key}, filter_type={self.filter_type}, "
-                f"texels={self.maps.shape}, displaced={hasattr(self.evaluator, 'hit')}]"
+                f"texels={self.maps.shape}, displaced={isinstance(self.evaluator, Displaced)}]"
             )
 
     return BTF

@@ -14,6 +14,9 @@ from mitsuba_plugins.lib.proposals import CosineLobes
 class Evaluator:
     """Evaluates the lobes of the neighbouring texels."""
 
+    #: What samples light directions unless told otherwise; measured by ``btfref bench proposals``.
+    sampling = "data"
+
     def __init__(self, maps):
         self.views = maps.views
         self.shape, self.filter_type = maps.shape, maps.filter_type

@@ -56,5 +56,4 @@ def material_name(btf):
     parent = btf.attributes.get("parent", {})
     if "mesostructure" in (parent.get("kind"), *btf.attributes):
         return str(parent.get("name", btf.attributes.get("mesostructure")))
-    path = getattr(btf, "path", None)
-    return Path(path).name.removesuffix(".btf.zarr") if path else "BTF"
+    return Path(btf.path).name.removesuffix(".btf.zarr") if btf.path else "BTF"

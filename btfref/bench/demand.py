@@ -215,6 +215,7 @@ def scenes(folder, btf, quick, progress):
     from btfref.bench.data import checker
     from btfref.registry import method
     from btfref.representations import load, save
+    from btfref.representations.protocol import SeesTexels
     from btfref.scene.demand import choice, demand, maps_needed
     from btfref.scene.shipped import scene_file
 
@@ -237,7 +238,7 @@ def scenes(folder, btf, quick, progress):
         if key == next(iter(paths)):
             shared, found[name] = None, {"methods": {}}
         # What a scene needs depends on the method only where lookups leave their texture coordinates.
-        elsewhere = hasattr(whole[key], "seen_texels")
+        elsewhere = isinstance(whole[key], SeesTexels)
         one = None if elsewhere else shared
         if one is None:
             for step in steps:

@@ -47,10 +47,14 @@ def run(args):
     parameters = fit_parameters(row, args.preset, given)
 
     from btfref.representations.file.container import read_info, save
+    from btfref.representations.protocol import FitsPartially
     from btfref.sampling import SampledBTF, open_store
 
     if args.partial:
-        representation = row.fit_partial(open_store(args.btf), **parameters)
+        fitting = row.fitting
+        if not isinstance(fitting, FitsPartially):
+            raise InputError("the method needs the whole BTF", field="--partial", got=row.key)
+        representation = fitting.fit_partial(open_store(args.btf), **parameters)
     else:
         btf = SampledBTF.load(args.btf)
         with Progress() as progress:

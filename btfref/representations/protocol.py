@@ -1,27 +1,51 @@
-"""What a representation is: anything with these methods satisfies it; there is no base class to derive from."""
+"""What a method provides. Anything with these members satisfies it; there is no class to derive from.
+
+:class:`Representation` and :class:`FitModule` are what every method has. The other protocols are optional, one for each
+thing that a method may do beside; whoever needs it asks ``isinstance(x, HasLevels)`` and never for a name in text.
+
+Some are asked before there is an instance, of the class: what to read of a file, whether a method can be lit in some
+way. A class object satisfies a protocol as an instance does (PEP 544, "Type objects and modules as implementations"),
+so that is the same ``isinstance``. ``issubclass`` is of no use here: it refuses protocols with data. What is said of a
+class therefore stands on the class, as a class attribute, a property or a method. Likewise a module satisfies
+:class:`FitsPartially`.
+
+What Dr.Jit ports provide stands in :mod:`mitsuba_plugins.protocol`.
+"""
 
 from __future__ import annotations
 
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import ArrayLike
+
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.store.store import BTFStore
+    from btfref.types import Facts, Progress
+
+#: Kinds of directions.
+Kind = Literal["view", "light"]
 
 
 @runtime_checkable
 class Representation(Protocol):
-    """A compressed BTF: maps, a definition in float64, and what the ports read.
+    """A compressed BTF: maps, a definition in float64, and what the ports read."""
 
-    Attributes
-    ----------
-    meta : dict
-        JSON-able facts. ``method``: key; ``filter_type``: "nearest" or "bilinear"; ``texels``: (rows, columns);
-        ``views``, ``lights``: {"name", "count"}; ``parameters``: of the fit; ``parent``: attributes of the sampled
-        BTF; ``versions``; ``constants``: scalars that become GLSL defines.
-    """
+    @property
+    def meta(self) -> Facts:
+        """JSON-able facts.
 
-    meta: dict[str, Any]
+        ``method``: key; ``filter_type``: "nearest" or "bilinear"; ``texels``: (rows, columns); ``views``, ``lights``:
+        {"name", "count"}; ``parameters``: of the fit; ``parent``: attributes of the sampled BTF; ``versions``;
+        ``constants``: scalars that become GLSL defines.
+        """
 
-    def evaluate(self, uv, w_light, w_view, *, lod=0.0) -> np.ndarray:
+    def evaluate(
+        self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
+    ) -> np.ndarray:
         """Value B in 1/sr, cosine included.
 
         Parameters
@@ -29,7 +53,7 @@ class Representation(Protocol):
         uv : array_like, shape (..., 2)
         w_light, w_view : array_like, shape (..., 3)
             Unit vectors in the local frame; the leading shapes broadcast.
-        lod : float
+        lod : array_like
             Level of detail, 0 = finest, a step for each halving of the resolution; methods without levels ignore it,
             those with levels also take one value a lookup.
 
@@ -64,5 +88,178 @@ class Representation(Protocol):
         """
 
     @classmethod
-    def from_arrays(cls, arrays, meta) -> Representation:
+    def from_arrays(cls, arrays: dict[str, np.ndarray], meta: Facts) -> Representation:
         """The representation whose :meth:`arrays` and ``meta`` these are."""
+
+
+@runtime_checkable
+class KeepsDirections(Protocol):
+    """Its maps have axes over views or lights, so that those of some directions can be read and kept alone."""
+
+    @property
+    def DIRECTION_AXES(self) -> Mapping[Kind, Mapping[str, int]]:  # noqa: N802 - a class attribute
+        """For "view", "light" or both: names of maps (``*`` is any text), and their axis over these directions."""
+
+
+@dataclass(frozen=True)
+class Entries:
+    """How texels name entries of codebooks.
+
+    Attributes
+    ----------
+    index : str
+        Map of names, uint32 [row, column, 1].
+    axes : dict of str to int
+        Maps, and their axis that runs over the entries.
+    mark : str
+        Map [row, column, …] of floats that every lookup of a texel reads.
+    """
+
+    index: str
+    axes: Mapping[str, int]
+    mark: str
+
+
+@runtime_checkable
+class HasEntries(Protocol):
+    """Its texels name entries of codebooks (clusters, materials), so that some can be read and kept alone."""
+
+    @property
+    def ENTRIES(self) -> Entries:  # noqa: N802 - a class attribute
+        """Which map holds the names, and which maps the entries."""
+
+
+@runtime_checkable
+class KeepsRows(Protocol):
+    """Axes of some maps are rows of their images, so that they can be read alone."""
+
+    @property
+    def ROWS_BY(self) -> Mapping[str, Sequence[int]]:  # noqa: N802 - a class attribute
+        """Names of maps (``*`` is any text), and those axes in the order of the file."""
+
+
+@runtime_checkable
+class HasLevels(Protocol):
+    """It has levels of detail: ``lod`` of a lookup counts, and fine levels need not be kept.
+
+    ``meta["levels"]`` describes each, ``meta["constants"]["first_level"]`` is the finest that is kept.
+    """
+
+    @property
+    def LEVELS(self) -> Sequence[str]:  # noqa: N802 - a class attribute
+        """Names of the maps that a level has; ``*`` is its number."""
+
+    @property
+    def max_lod(self) -> float:
+        """Level of detail of the coarsest."""
+
+    @property
+    def sampling_levels(self) -> int:
+        """Number of levels that :meth:`sampling_tables` has guides for."""
+
+    def sampling_tables(self, level: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """As :meth:`Representation.sampling_tables`, with the rows and columns of a level."""
+
+
+@runtime_checkable
+class Spreads(Protocol):
+    """Its values jump at silhouettes and borders of shadows, and it knows where."""
+
+    def spread(self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike) -> np.ndarray:
+        """How much B changes when the hit moves by what a float32 port may be off.
+
+        Parameters
+        ----------
+        uv, w_light, w_view : array_like
+            As for :meth:`Representation.evaluate`.
+
+        Returns
+        -------
+        ndarray, shape (..., 3)
+        """
+
+
+@runtime_checkable
+class SeesTexels(Protocol):
+    """Its lookups read texels elsewhere than at their texture coordinates."""
+
+    def seen_texels(self, uv: ArrayLike, w_view: ArrayLike) -> np.ndarray:
+        """Flat indices of the texels that each lookup blends, shapes (N, 2), (N, 3) -> (N, T)."""
+
+
+@runtime_checkable
+class SharesTables(Protocol):
+    """Its texels combine a few tables over views and lights."""
+
+    def shared_tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The tables, and how texels combine them.
+
+        Returns
+        -------
+        tables : ndarray of float, shape (cluster, 1 + component, view, light, 3)
+        cluster : ndarray of int64, shape (texels,)
+        coefficient : ndarray of float64, shape (texels, 1 + component)
+            ``B_x = Σ_m coefficient[x, m] tables[cluster[x], m]``; the first one is 1.
+        """
+
+
+@runtime_checkable
+class LitByHarmonics(SharesTables, Protocol):
+    """Its shared tables are lit by environments in spherical harmonics."""
+
+    @property
+    def harmonic_shader(self) -> str:
+        """GLSL file, relative to the shader directory."""
+
+
+@runtime_checkable
+class LitByTransfer(SharesTables, Protocol):
+    """Its shared tables are lit by harmonics after radiance transfer through a mesh."""
+
+    @property
+    def transfer_shader(self) -> str:
+        """GLSL file, relative to the shader directory."""
+
+
+@runtime_checkable
+class FitModule(Protocol):
+    """The module of a method that makes representations."""
+
+    @property
+    def PRESETS(self) -> Mapping[str, Facts]:  # noqa: N802 - a constant of a module
+        """Named settings of :meth:`fit`; "paper" has those of the method's paper."""
+
+    def fit(
+        self, btf: SampledBTF, *, seed: int = 0, progress: Progress | None = None, **parameters: Any
+    ) -> Representation:
+        """A representation of a sampled BTF; same seed, same result.
+
+        Raises
+        ------
+        InputError
+            For parameters out of range.
+        """
+
+
+@runtime_checkable
+class FitsPartially(Protocol):
+    """A module that also fits what is there of a store that was filled in part."""
+
+    def fit_partial(self, store: BTFStore, **parameters: Any) -> Representation:
+        """A representation of what is there.
+
+        Raises
+        ------
+        InputError
+            For a store without any sample.
+        """
+
+
+def direction_axes(made: object, kind: Kind) -> Mapping[str, int]:
+    """Maps of a representation or its class, and their axis over views or lights; empty for a method without."""
+    return made.DIRECTION_AXES.get(kind, {}) if isinstance(made, KeepsDirections) else {}
+
+
+def max_lod(representation: object) -> float:
+    """Level of detail of the coarsest level; 0 for a method without levels."""
+    return representation.max_lod if isinstance(representation, HasLevels) else 0.0

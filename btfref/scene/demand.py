@@ -193,21 +193,22 @@ def choice(one, *, lights=True):
     from btfref.registry import method
     from btfref.representations.file.container import read_info, read_maps
     from btfref.representations.file.resident import KINDS
+    from btfref.representations.protocol import HasEntries, HasLevels, direction_axes
 
     file = one.file
     made = method(read_info(file)["method"], file=file).representation
     chosen = {"views": one.views, "lights": one.lights if lights else None}
-    for kind, axes in KINDS.items():
+    for kind in KINDS:
         mask = chosen[f"{kind}s"]
-        known = mask is not None and mask.any() and getattr(made, axes, {})
+        known = mask is not None and mask.any() and direction_axes(made, kind)
         chosen[f"{kind}s"] = np.flatnonzero(mask) if known else None
-    names = getattr(made, "ENTRIES", None)
     chosen["entries"], chosen["levels"] = None, None
-    if names is not None and one.texels.any():
+    if isinstance(made, HasEntries) and one.texels.any():
+        names = made.ENTRIES
         arrays, meta = read_maps(file, lambda name: name == names.index)
         if "resident_entries" not in meta:
             chosen["entries"] = np.unique(arrays[names.index][one.texels])
-    if getattr(made, "LEVELS", None) is not None:
+    if isinstance(made, HasLevels):
         _, meta = read_maps(file, lambda name: False)
         total = len(meta["levels"])
         chosen["levels"] = np.arange(one.first_level(total), total)
@@ -228,8 +229,10 @@ def maps_needed(demanded, representation):
         ``maps``: name to (needed, whole): "levels" of methods that have them, and for each map of indices (clusters,
         materials) how many of its entries occur in needed texels.
     """
+    from btfref.representations.protocol import HasLevels
+
     maps = {}
-    if hasattr(representation, "max_lod"):
+    if isinstance(representation, HasLevels):
         total = int(representation.max_lod) + 1
         maps["levels"] = total - demanded.first_level(total), total
     for name, array in representation.arrays().items():

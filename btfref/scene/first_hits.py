@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from btfref.conventions import texel_stencil
+from btfref.numerics.sphere import interpolation
 
 #: Least margin of directions, radians: renderers round.
 MARGIN = 1e-4
@@ -33,21 +34,21 @@ class Touched:
         #: Representation whose lookups read texels elsewhere than at their coordinates.
         self.surface = None
         if shape is None:
-            from btfref.numerics.sphere import interpolation
             from btfref.registry import method
             from btfref.representations.file.container import load, read_maps
+            from btfref.representations.protocol import SeesTexels
 
             arrays, meta = read_maps(file, lambda name: name.startswith(("view_", "light_")))
             self.size = tuple(meta["texels"])
             self.tables = [interpolation.from_arrays(arrays, kind) for kind in ("view", "light")]
             counts = [meta[f"{kind}s"]["count"] for kind in ("view", "light")]
-            if hasattr(method(meta["method"], file=file).representation, "seen_texels"):
+            if isinstance(method(meta["method"], file=file).representation, SeesTexels):
                 self.surface = load(file)
         else:
             views, lights, self.size = shape
             self.tables, counts = [views.interpolation, lights.interpolation], [len(views), len(lights)]
         # Kept views are indices of their own: here, those of the whole count.
-        self.tables = [getattr(table, "inner", table) for table in self.tables]
+        self.tables = [interpolation.whole(table) for table in self.tables]
         self.file, self.margin = file, margin
         self.views, self.lights = (np.zeros(n, bool) for n in counts)
         self.pairs, self.texels = np.zeros(counts, bool), np.zeros(self.size, bool)

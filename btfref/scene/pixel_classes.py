@@ -85,6 +85,8 @@ def _displaced_edges(scene, grid):
     import drjit as dr
     import mitsuba as mi
 
+    from mitsuba_plugins.protocol import is_displaced
+
     if not any(is_displaced(shape.bsdf()) for shape in scene.shapes()):
         return False
     delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
@@ -111,11 +113,6 @@ def _displaced_edges(scene, grid):
             step = np.abs(np.stack(values[1:]) - values[0]).max((0, 1))
             spread, largest = np.maximum(spread, step), np.maximum(largest, np.abs(values[0]).max(0))
     return (spread > EDGE * largest.max(initial=0)).reshape(height, width)
-
-
-def is_displaced(bsdf):
-    """Whether a BSDF, or one inside of it, finds its values on a geometry of its own."""
-    return "displaced=True" in str(bsdf)
 
 
 def _part(ndim, axis, part):

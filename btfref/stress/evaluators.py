@@ -112,11 +112,12 @@ def _mitsuba():
 def _drjit(path, *, fast):
     dr, mi = _mitsuba()
     import mitsuba_plugins
+    from mitsuba_plugins.protocol import LevelledEvaluator
 
     mitsuba_plugins.register()
     # The level is fixed to 0 here; other levels go to the plugin's evaluator directly.
     bsdf = mi.load_dict({"type": "btf", "filename": str(path), "lod": "none"})
-    levelled = hasattr(bsdf.evaluator, "max_lod")
+    levelled = isinstance(bsdf.evaluator, LevelledEvaluator)
 
     def evaluate(lookups):
         from mitsuba_plugins.lib.lookup import valid_directions

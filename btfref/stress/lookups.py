@@ -186,9 +186,8 @@ _NOT_DIRECTIONS = np.array(
 
 def _on_edges(rng, n, arrays, prefix):
     """Directions on borders between cells of the interpolation: edges of triangles, or azimuths of ring samples."""
-    table = interpolation.from_arrays(arrays, prefix)
-    table = getattr(table, "inner", table)
-    if hasattr(table, "triangles"):
+    table = interpolation.whole(interpolation.from_arrays(arrays, prefix))
+    if isinstance(table, interpolation.TriangleInterpolation):
         triangle = np.asarray(table.triangles, float)[rng.integers(0, len(table.triangles), n)]
         t = rng.random((n, 1))
         return unit((1 - t) * triangle[:, 0:3] + t * triangle[:, 3:6])

@@ -14,6 +14,7 @@ import numpy as np
 from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
 from btfref.numerics.sphere.directions import DirectionSet, directions
+from btfref.representations.protocol import Spreads
 from btfref.sampling import SampledBTF
 from btfref.stress.data import make
 from btfref.stress.judging import limit_finding
@@ -150,9 +151,9 @@ def half_turn(btf):
 def continuous(method, representation, name, *, seed=0, blocks=1):
     """No jumps where cells of directions, rings, seams, tiles and levels meet.
 
-    A height field's silhouettes and shadows are jumps by nature: where it has them (``spread``) nothing is asked.
+    A height field's silhouettes and shadows are jumps by nature: where it has them (`Spreads`) nothing is asked.
     """
-    if hasattr(representation, "spread") or representation.meta["filter_type"] != "bilinear":
+    if isinstance(representation, Spreads) or representation.meta["filter_type"] != "bilinear":
         return
     from btfref.stress.judging import valid_lookups
 

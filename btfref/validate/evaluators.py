@@ -43,6 +43,7 @@ def probe_gates(path, *, seed=7):
     """
     from btfref.numerics.sphere.directions import DirectionSet
     from btfref.representations import load
+    from btfref.representations.protocol import max_lod
     from btfref.stress.evaluators import definition, port
     from btfref.stress.lookups import Lookups
 
@@ -53,7 +54,7 @@ def probe_gates(path, *, seed=7):
     )
     rng = np.random.default_rng(seed)
     points = probe_points(rng, PROBES, views, lights)
-    lod = rng.uniform(0, getattr(representation, "max_lod", 0), PROBES).astype(np.float32)
+    lod = rng.uniform(0, max_lod(representation), PROBES).astype(np.float32)
     drawn = [np.zeros(PROBES, np.uint8)] * 4
     lookups = Lookups(*points, lod, *drawn)
     reference = definition(representation, lookups)

@@ -13,6 +13,7 @@ from btfref.comparison.waterfall import Picture, waterfall
 from btfref.conventions import PixelClass
 from btfref.gates.verdicts import Measured, judge
 from btfref.images.display import fit_display
+from btfref.representations.protocol import max_lod
 from btfref.scene.shipped import scene_file
 from btfref.validate.cell import ENVIRONMENT_GATES, GATES
 from btfref.validate.evaluators import sampling_gates
@@ -167,7 +168,7 @@ class Bench:
         representation, _ = self.fit(subject)
         rng = np.random.default_rng(11)
         points = probe_points(rng, 4000, self.btf.views, self.btf.lights)
-        lod = rng.uniform(0, getattr(representation, "max_lod", 0), len(points[0])).astype(np.float32)
+        lod = rng.uniform(0, max_lod(representation), len(points[0])).astype(np.float32)
         value = probe(representation, *points, lod)
         return [
             *agreement(value, representation.evaluate(*points, lod=lod)).gates,

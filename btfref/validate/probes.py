@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from btfref.representations.protocol import Spreads
+
 
 def hemisphere(rng, n):
     """Uniform directions on the upper hemisphere, float32, shape (n, 3)."""
@@ -49,7 +51,7 @@ def hit_allowance(representation, value, reference, points):
 
     Where ``value`` and ``reference`` agree to float32 anyway nothing is needed, and nothing is allowed.
     """
-    if not hasattr(representation, "spread"):
+    if not isinstance(representation, Spreads):
         return None
     scale = np.maximum(np.abs(reference), 1e-3 * np.abs(reference).max())
     differs = (np.abs(np.reshape(value, reference.shape) - reference) > 1e-6 * scale).any(-1)

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from btfref.numerics.sphere import interpolation
+from btfref.representations.protocol import HasLevels
 
 #: Cells in sin² θ and in φ. Finer cells would resolve more than directions 15° apart contain.
 N_RADIAL, N_AZIMUTH = 8, 32
@@ -55,7 +56,7 @@ def cell_densities(mean, lights):
         Positive; mean over the cells 1, at least ``COSINE_SHARE``.
     """
     w = cell_directions()
-    if hasattr(lights, "slots"):
+    if isinstance(lights, interpolation.ResidentInterpolation):
         # Lights that are not kept are not sampled by the data either: they count as black.
         mean = np.where(
             lights.slots == interpolation.MISSING, 0, mean[..., np.minimum(lights.slots, mean.shape[-1] - 1)]
@@ -151,11 +152,11 @@ class LightGuide:
     """
 
     def __init__(self, representation, views, sampling):
-        n_levels = getattr(representation, "sampling_levels", 1)
-        if sampling == "cosine" or n_levels == 1:
-            tables = [representation.sampling_tables()]
+        if sampling == "data" and isinstance(representation, HasLevels):
+            levels = range(representation.sampling_levels)
+            tables = [representation.sampling_tables(level) for level in levels]
         else:
-            tables = [representation.sampling_tables(level) for level in range(n_levels)]
+            tables = [representation.sampling_tables()]
         self.shapes = [group.shape for group, _ in tables]
         if sampling == "cosine":
             group, n_views = np.zeros(self.shapes[0], np.uint32), tables[0][1].shape[1]

@@ -18,12 +18,13 @@ from btfref.representations import load, save
 from btfref.representations.file.resident import KINDS, SLOTS, keeping, with_views
 from btfref.representations.file.rows import RowReader
 from btfref.representations.gbrdf.definition import texel_weights
+from btfref.representations.protocol import direction_axes
 
 CASES = [
     (key, kind)
     for key, row in methods().items()
-    for kind, axes in KINDS.items()
-    if getattr(row.representation, axes, None)
+    for kind in KINDS
+    if direction_axes(row.representation, kind)
 ]
 PLANE = files("btfref.scene.shipped").joinpath("plane.xml")
 
@@ -52,7 +53,7 @@ def test_kept_directions_give_the_same_numbers_and_others_none(need, fits, llvm,
     kept = 2 * total // 3
     chosen = np.sort(rng.choice(total, kept, replace=False))
     some = load(path, **{f"{kind}s": chosen})
-    for pattern, axis in getattr(type(whole), KINDS[kind]).items():
+    for pattern, axis in direction_axes(whole, kind).items():
         names = fnmatch.filter(some.maps, pattern)
         assert names or pattern == "mean"
         assert all(some.maps[name].shape[axis] == kept for name in names)

@@ -40,8 +40,10 @@ def load(mi, path, **parameters):
 def test_these_methods_have_lobes_of_their_own(llvm):
     from importlib import import_module
 
+    from mitsuba_plugins.protocol import Proposes
+
     having = {
-        key for key, row in methods().items() if hasattr(import_module(row.plugin).Evaluator, "proposal")
+        key for key, row in methods().items() if isinstance(import_module(row.plugin).Evaluator, Proposes)
     }
     assert having == set(OWN)
 

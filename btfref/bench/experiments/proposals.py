@@ -90,7 +90,9 @@ def run(*, quick=False, progress=None, btf=None, only=None):
 def _has_lobes(row):
     from importlib import import_module
 
-    return hasattr(import_module(row.plugin).Evaluator, "proposal")
+    from mitsuba_plugins.protocol import Proposes
+
+    return isinstance(import_module(row.plugin).Evaluator, Proposes)
 
 
 def _efficiency(pictures, times):

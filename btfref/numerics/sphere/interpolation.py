@@ -265,6 +265,11 @@ class ResidentInterpolation:
         return np.where(absent, 0, slot), weight
 
 
+def whole(interpolation):
+    """The interpolation whose indices are samples, not slots: that inside of one of which only some are kept."""
+    return interpolation.inner if isinstance(interpolation, ResidentInterpolation) else interpolation
+
+
 def from_arrays(arrays, prefix):
     """The interpolation whose tables are stored under ``prefix`` (see :meth:`RingInterpolation.arrays`).
 

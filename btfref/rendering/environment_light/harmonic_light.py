@@ -15,6 +15,7 @@ from btfref.errors import InputError
 from btfref.numerics.sphere import harmonics, interpolation
 from btfref.numerics.sphere.quadrature import gauss_hemisphere
 from btfref.rendering.environment_light import light_set
+from btfref.representations.protocol import LitByHarmonics
 
 #: Bands of the paper.
 ORDER = 5
@@ -32,18 +33,18 @@ ESTIMATE = 48
 CHUNK = 1 << 11
 
 
-def shared_tables(representation, attribute, *, file=None):
-    """``representation.shared_tables()`` of a method that has ``attribute``.
+def shared_tables(representation, lit_by, *, file=None):
+    """``representation.shared_tables()`` of a method that satisfies a protocol, `LitByHarmonics` or `LitByTransfer`.
 
     Raises
     ------
     InputError
         For a method without tables that texels share.
     """
-    if not hasattr(representation, attribute):
+    if not isinstance(representation, lit_by):
         from btfref.registry import methods
 
-        having = [key for key, row in methods().items() if hasattr(row.representation, attribute)]
+        having = [key for key, row in methods().items() if isinstance(row.representation, lit_by)]
         raise InputError(
             "spherical harmonics need tables over lights that texels share",
             file=file,
@@ -122,7 +123,7 @@ def table_coefficients(representation, order, *, file=None):
     -------
     ndarray of float64, shape (cluster, view, order², 1 + component, 3)
     """
-    tables, _, _ = shared_tables(representation, "harmonic_shader", file=file)
+    tables, _, _ = shared_tables(representation, LitByHarmonics, file=file)
     projection = light_projection(representation, order)
     k, m, v, n, _ = tables.shape
     flat = np.moveaxis(tables.astype(np.float32), 3, 0).reshape(n, -1)

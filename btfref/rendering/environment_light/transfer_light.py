@@ -16,6 +16,7 @@ from btfref import conventions
 from btfref.numerics.sphere import harmonics, interpolation
 from btfref.numerics.sphere.parabolic import bilinear_stencil, texel_directions
 from btfref.rendering.environment_light.harmonic_light import shared_tables, table_coefficients
+from btfref.representations.protocol import LitByTransfer
 
 #: Components of the matrices and of the material while the light moves, as in the paper.
 MOVING = 4, 1
@@ -39,7 +40,7 @@ class Material:
     """
 
     def __init__(self, representation, order, *, map_size=16, file=None):
-        _, cluster, weights = shared_tables(representation, "transfer_shader", file=file)
+        _, cluster, weights = shared_tables(representation, LitByTransfer, file=file)
         # Clusters that no texel has are not computed.
         self.present, self.cluster = np.unique(cluster, return_inverse=True)
         self.weights, self.order, self.map_size = weights, order, map_size

@@ -15,6 +15,7 @@ from btfref.errors import InputError
 from btfref.numerics.footprint import ANISOTROPY, probe_weight
 from btfref.rendering.environment_light.lighting import lighting_of
 from btfref.rendering.result import RenderResult
+from btfref.representations.protocol import HasLevels
 from btfref.scene.description import read_scene
 from btfref.scene.visible import visible_points
 
@@ -109,7 +110,7 @@ def _radiance(representation, points, mesh, lights, prepared):
     """Radiance towards the viewer without the material's factor, shape (N, 3)."""
 
     def evaluate(uv, w_light, w_view, at):
-        if points.footprint is None or not hasattr(representation, "max_lod"):
+        if points.footprint is None or not isinstance(representation, HasLevels):
             return representation.evaluate(uv, w_light, w_view)
         lod, step, ratio = (a[at] for a in points.footprint)
         value = np.zeros((len(uv), 3))

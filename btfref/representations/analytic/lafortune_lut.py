@@ -25,7 +25,7 @@ class Representation(light_functions.AnalyticMaps):
     """Maps of :class:`btfref.representations.analytic.lafortune.Representation` and ``factor`` [row, column, view]."""
 
     #: Maps by view; see :mod:`btfref.representations.file.resident`.
-    VIEW_AXES: ClassVar = {"factor": 2}
+    DIRECTION_AXES: ClassVar = {"view": {"factor": 2}}
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored. Never negative.

@@ -127,7 +127,7 @@ def luminance_blocks(btf, progress=None, label="fit"):
             n_views, n_lights, -1, 3
         )
         if not np.isfinite(block).all():
-            raise InputError("the BTF holds a value that is not finite", file=getattr(btf, "path", None))
+            raise InputError("the BTF holds a value that is not finite", file=btf.path)
         luminance = block @ conventions.LUMINANCE.astype(np.float32)
         energy = np.einsum("vln,vln->n", luminance, luminance, dtype=float)
         chroma = np.einsum("vlnc,vln->nc", block, luminance, dtype=float)

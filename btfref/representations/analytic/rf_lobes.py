@@ -59,7 +59,7 @@ class Representation(light_functions.AnalyticMaps):
     """  # noqa: D205
 
     #: Maps by view; see :mod:`btfref.representations.file.resident`.
-    VIEW_AXES: ClassVar = {"lobes": 2}
+    DIRECTION_AXES: ClassVar = {"view": {"lobes": 2}}
     ROWS_BY: ClassVar = {"lobes": (2,)}
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):

@@ -37,7 +37,7 @@ class Representation(light_functions.AnalyticMaps):
     """``polynomial`` [row, column, view, 6], ``chroma`` [row, column, 3], and the direction tables."""
 
     #: Maps by view; see :mod:`btfref.representations.file.resident`.
-    VIEW_AXES: ClassVar = {"polynomial": 2}
+    DIRECTION_AXES: ClassVar = {"view": {"polynomial": 2}}
     ROWS_BY: ClassVar = {"polynomial": (2,)}
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):

@@ -1,9 +1,9 @@
 """How maps of any number of axes stand as images in OpenEXR files.
 
 A part's channels are the last axis of its map; the other axes fold into the image: trailing axes into columns while
-they fit, the rest into rows. Axes of which scenes need a part (views, clusters: ``ROWS_BY`` of the class) come first,
-as rows, so that those rows can be read alone (:mod:`btfref.representations.file.rows`); the manifest's ``rows`` lists
-them.
+they fit, the rest into rows. Axes of which scenes need a part (views, clusters) come first, as rows, where the method
+asks for it (:class:`~btfref.representations.protocol.KeepsRows`): those rows can be read alone
+(:mod:`btfref.representations.file.rows`). The manifest's ``rows`` lists the axes.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from __future__ import annotations
 from fnmatch import fnmatchcase
 
 import numpy as np
+
+from btfref.representations.protocol import KeepsRows
 
 #: Columns up to which further axes become columns.
 MAXIMUM_WIDTH = 8192
@@ -29,8 +31,8 @@ def image_size(shape, leading=0):
 
 
 def leading_axes(made, name):
-    """Axes of a map that are rows of its image, so that they can be read alone: ``ROWS_BY`` of the class."""
-    patterns = getattr(made, "ROWS_BY", {})
+    """Axes of a map that are rows of its image, so that they can be read alone; ``made`` is the class."""
+    patterns = made.ROWS_BY if isinstance(made, KeepsRows) else {}
     return next((list(axes) for pattern, axes in patterns.items() if fnmatchcase(name, pattern)), [])
 
 

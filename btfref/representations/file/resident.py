@@ -1,47 +1,29 @@
 """Representations of which only a part is kept: maps that a scene cannot ask for need no memory.
 
-A method says which axis of which map runs over views and over lights (``VIEW_AXES`` and ``LIGHT_AXES`` of its class;
-``*`` stands for any text). The directions stay what they are, and with them every interpolation weight; a table of
-slots takes a direction to its place in the shortened maps.
+A method says which axis of which map runs over views and over lights
+(:class:`~btfref.representations.protocol.KeepsDirections`). The directions stay what they are, and with them every
+interpolation weight; a table of slots takes a direction to its place in the shortened maps.
 
-Where texels name entries of codebooks (clusters, materials), ``ENTRIES`` of the class says which map holds the names,
-which axis of which map runs over the entries, and which map of numbers a lookup of a texel always reads: of texels
-whose entry is not kept it becomes NaN. Where maps are those of levels of detail, ``LEVELS`` says how they are called.
+Where texels name entries of codebooks (:class:`~btfref.representations.protocol.HasEntries`), the method says which map
+holds the names, which axis of which map runs over the entries, and which map of numbers a lookup of a texel always
+reads: of texels whose entry is not kept it becomes NaN. Where maps are those of levels of detail
+(:class:`~btfref.representations.protocol.HasLevels`), it says how they are called.
 
 A lookup that needs what is not there is an error in NumPy and not a number in the ports, never another value.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.sphere.interpolation import MISSING
+from btfref.representations.protocol import HasEntries, HasLevels, Kind, direction_axes
 
-#: Kinds of directions: what their maps' axes are called in a class, and in the meta of a selection.
-KINDS = {"view": "VIEW_AXES", "light": "LIGHT_AXES"}
-
-
-@dataclass(frozen=True)
-class Entries:
-    """How texels name entries of codebooks.
-
-    Attributes
-    ----------
-    index : str
-        Map of names, uint32 [row, column, 1].
-    axes : dict of str to int
-        Maps, and their axis that runs over the entries.
-    mark : str
-        Map [row, column, …] of floats that every lookup of a texel reads.
-    """
-
-    index: str
-    axes: dict
-    mark: str
+#: Kinds of directions.
+KINDS: tuple[Kind, ...] = ("view", "light")
 
 
 def slots_name(kind):
@@ -64,8 +46,8 @@ def keeping(representation, **choice):
     Parameters
     ----------
     representation : Representation
-        Its class has ``VIEW_AXES`` (for ``views``) and ``LIGHT_AXES`` (for ``lights``): names of maps and the axis that
-        runs over these directions. For ``entries`` it has ``ENTRIES``, for ``levels`` ``LEVELS``.
+        It keeps its maps by the directions for ``views`` and ``lights``, has entries for ``entries``, and levels for
+        ``levels``; see :mod:`btfref.representations.protocol`.
     views, lights, entries : array_like of int, optional
         Indices of those to keep, in any order, at least one; None for all.
     levels : array_like of int, optional
@@ -106,14 +88,14 @@ def select(arrays, meta, made, *, views=None, lights=None, entries=None, levels=
 
 
 def axes_of(made, method, kind="view", *, file=None):
-    """``VIEW_AXES`` or ``LIGHT_AXES`` of a class of representations.
+    """Maps of a class of representations that have an axis over views or lights, and that axis.
 
     Raises
     ------
     InputError
         When it has none.
     """
-    axes = getattr(made, KINDS[kind], {})
+    axes = direction_axes(made, kind)
     if not axes:
         raise InputError(f"the method keeps no maps by {kind}", file=file, field=f"{kind}s", got=method)
     return axes
@@ -157,32 +139,29 @@ def _with_levels(arrays, meta, made, levels, file):
 
 
 def entries_of(made, method, *, file=None):
-    """``ENTRIES`` of a class of representations.
+    """How texels name entries in a class of representations.
 
     Raises
     ------
     InputError
         When it has none.
     """
-    return _attribute(made, "ENTRIES", "entries that texels name", "entries", method, file)
+    if not isinstance(made, HasEntries):
+        raise InputError("the method has no entries that texels name", file=file, field="entries", got=method)
+    return made.ENTRIES
 
 
 def levels_of(made, method, *, file=None):
-    """``LEVELS`` of a class of representations.
+    """Names of the maps of a level of detail in a class of representations.
 
     Raises
     ------
     InputError
         When it has none.
     """
-    return _attribute(made, "LEVELS", "levels of detail", "levels", method, file)
-
-
-def _attribute(made, name, what, field, method, file):
-    found = getattr(made, name, None)
-    if not found:
-        raise InputError(f"the method has no {what}", file=file, field=field, got=method)
-    return found
+    if not isinstance(made, HasLevels):
+        raise InputError("the method has no levels of detail", file=file, field="levels", got=method)
+    return made.LEVELS
 
 
 def needed_rows(made, manifest, choice):
@@ -216,7 +195,7 @@ def needed_rows(made, manifest, choice):
             # Of a file that holds some directions alone, indices are not places.
             if indices is None or slots_name(kind) in manifest["arrays"]:
                 continue
-            for pattern, axis in getattr(made, KINDS[kind], {}).items():
+            for pattern, axis in direction_axes(made, kind).items():
                 if fnmatchcase(name, pattern):
                     axes[axis] = np.asarray(indices, np.int64)
         if choice.get("entries") is not None:

@@ -24,9 +24,10 @@ from btfref.numerics.sphere.frames import surface_frame
 from btfref.numerics.sphere.halfway import half_vector
 from btfref.numerics.sphere.parabolic import bilinear_stencil
 from btfref.precision import computing_in, real
-from btfref.representations.file.resident import Entries, refuse_absent
+from btfref.representations.file.resident import refuse_absent
 from btfref.representations.guide import group_means, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points
+from btfref.representations.protocol import Entries
 
 #: Tiles by which a port's hit may differ from the definition's: float32 positions at the far end of the longest ray.
 HIT_TOLERANCE = 2e-6

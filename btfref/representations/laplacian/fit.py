@@ -204,7 +204,7 @@ def _pyramids(btf, n_levels, reduction):
     rows, columns = btf.values.shape[2:4]
     matrix = texel_matrix(btf.values)
     if not np.isfinite(matrix).all():
-        raise InputError("the BTF holds a value that is not finite", file=getattr(btf, "path", None))
+        raise InputError("the BTF holds a value that is not finite", file=btf.path)
     matrix = matrix.reshape(rows, columns, -1, 3)
     return [gaussian_pyramid(matrix @ row.astype(np.float32), n_levels, reduction) for row in FROM_RGB]
 

@@ -27,8 +27,7 @@ class Representation(StoredMaps):
     direction tables. ``meta["levels"]`` lists rows, columns and numbers of components of each level.
     """
 
-    VIEW_AXES: ClassVar = {"basis_*": 0, "mean": 0}
-    LIGHT_AXES: ClassVar = {"basis_*": 1, "mean": 1}
+    DIRECTION_AXES: ClassVar = {"view": {"basis_*": 0, "mean": 0}, "light": {"basis_*": 1, "mean": 1}}
     LEVELS: ClassVar = ("basis_*", "weights_*")
     ROWS_BY: ClassVar = {"basis_*": (0,), "mean": (0,)}
 

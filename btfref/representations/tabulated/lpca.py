@@ -17,7 +17,7 @@ from btfref.numerics.solvers.clustering import leading_axes, local_pca
 from btfref.numerics.solvers.lowrank import range_basis, refined_basis, texel_matrix
 from btfref.numerics.solvers.threads import one_blas_thread
 from btfref.precision import real
-from btfref.representations.file.resident import Entries, refuse_absent
+from btfref.representations.file.resident import refuse_absent
 from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
     StoredMaps,
@@ -28,6 +28,7 @@ from btfref.representations.lookup import (
     positive_integer,
     stored,
 )
+from btfref.representations.protocol import Entries
 
 #: "paper": the setting of the 2004 paper's timings, 16 clusters with a mean and 4 components, in floats.
 PRESETS = {"paper": {"clusters": 16, "components": 4, "storage": "float"}}
@@ -47,8 +48,7 @@ class Representation(StoredMaps):
     [row, column, component], ``cluster`` [row, column, 1] uint32, and the direction tables.
     """
 
-    VIEW_AXES: ClassVar = {"basis": 2}
-    LIGHT_AXES: ClassVar = {"basis": 3}
+    DIRECTION_AXES: ClassVar = {"view": {"basis": 2}, "light": {"basis": 3}}
     ENTRIES: ClassVar = Entries("cluster", {"basis": 0}, "weights")
     ROWS_BY: ClassVar = {"basis": (0, 2)}
 

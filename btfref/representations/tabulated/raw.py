@@ -25,8 +25,7 @@ PRESETS = {"paper": {}}
 class Representation(StoredMaps):
     """Table ``values`` [row, column, view, light, 3] and the directions it is sampled at."""
 
-    VIEW_AXES: ClassVar = {"values": 2}
-    LIGHT_AXES: ClassVar = {"values": 3}
+    DIRECTION_AXES: ClassVar = {"view": {"values": 2}, "light": {"values": 3}}
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored."""

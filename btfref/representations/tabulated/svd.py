@@ -31,8 +31,7 @@ PRESETS = {"paper": {"components": 150, "storage": "float"}}
 class Representation(StoredMaps):
     """Maps: ``basis`` [component, view, light, 3], ``weights`` [row, column, component], direction tables."""
 
-    VIEW_AXES: ClassVar = {"basis": 1}
-    LIGHT_AXES: ClassVar = {"basis": 2}
+    DIRECTION_AXES: ClassVar = {"view": {"basis": 1}, "light": {"basis": 2}}
     ROWS_BY: ClassVar = {"basis": (1,)}
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):

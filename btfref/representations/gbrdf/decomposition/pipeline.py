@@ -208,4 +208,4 @@ def save_stages(stages, path):
 def _refuse_not_finite(btf):
     for view in range(len(btf.views)):
         if not np.isfinite(btf.values[view]).all():
-            raise InputError("the BTF holds a value that is not finite", file=getattr(btf, "path", None))
+            raise InputError("the BTF holds a value that is not finite", file=btf.path)
