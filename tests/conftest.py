@@ -19,6 +19,8 @@ CAPABILITIES = {
     ),
     "glslang": lambda: shutil.which("glslangValidator") or shutil.which("glslang"),
     "sklearn": lambda: importlib.util.find_spec("sklearn"),
+    "matplotlib": lambda: importlib.util.find_spec("matplotlib"),
+    "distributed": lambda: importlib.util.find_spec("distributed"),
     "llvm": lambda: _llvm(),
     "gl": lambda: _gl(),
 }

@@ -1,6 +1,7 @@
 """The limits of gates and tests, read from ``tolerances.toml``, where each has its reason.
 
-The file beside this module holds what methods share. A method brings what concerns it alone in a ``tolerances.toml``
+The file beside this module holds the gates that methods share; ``limits/`` holds a file per wing with what only the tests
+of that wing ask for. A method brings what concerns it alone in a ``tolerances.toml``
 beside its own module (`btfref.registry.Method.tolerances`): gates of its own, and ``[GATE.METHOD]`` with limits that it
 has instead of those of a shared gate (`tolerance_of`).
 """
@@ -83,16 +84,18 @@ def parse(text: str, *, file: PathLike = "tolerances.toml") -> dict[str, Gate]:
 
 @functools.cache
 def _gates() -> dict[str, Gate]:
-    """All gates: the shared ones, then those of the methods."""
-    gates = parse(resources.files("btfref.gates").joinpath("tolerances.toml").read_text("utf-8"))
+    """All gates: the shared ones, then those of the wings and of the methods."""
+    folder = resources.files("btfref.gates")
+    gates = parse(folder.joinpath("tolerances.toml").read_text("utf-8"))
+    wings = sorted(folder.joinpath("limits").iterdir(), key=lambda wing: wing.name)
     # A dict, since methods that share a folder share its file.
     files = dict.fromkeys(row.tolerances for row in methods().values())
-    for file in files:
+    for file in (*wings, *files):
         if file is None or not file.is_file():
             continue
-        own = parse(file.read_text("utf-8"), file=file)
+        own = parse(file.read_text("utf-8"), file=str(file))
         if twice := sorted(own.keys() & gates.keys()):
-            raise InputError("gates that are there already", file=file, got=", ".join(twice))
+            raise InputError("gates that are there already", file=str(file), got=", ".join(twice))
         gates |= own
     return gates
 

@@ -24,9 +24,11 @@ def _files(root):
 
 
 @pytest.fixture(scope="module")
-def cluster():
+def cluster(need):
     """A client of two local workers, each a process of its own."""
-    distributed = pytest.importorskip("distributed")
+    need("distributed")
+    import distributed
+
     root = str(Path(__file__).parents[2])
     os.environ["PYTHONPATH"] = os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])
     with (
@@ -58,9 +60,9 @@ def test_workers_write_the_same_bytes(tmp_path, cluster, extra):
 
 @pytest.mark.filterwarnings("default")
 @pytest.mark.parametrize("workers", [1, 4])
-def test_the_number_of_workers_changes_no_byte(tmp_path, workers):
+def test_the_number_of_workers_changes_no_byte(need, tmp_path, workers):
     """A cluster of one and one of four, started by the synthesis itself; the one of two is above."""
-    pytest.importorskip("distributed")
+    need("distributed")
     alone, shared = tmp_path / "alone.btf.zarr", tmp_path / "shared.btf.zarr"
     settings = SETTINGS | {"estimator": "surface"}
     synthesize_store(alone, "checker", **settings)

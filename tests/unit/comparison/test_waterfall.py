@@ -51,10 +51,16 @@ def test_stages_that_do_not_add_up_say_which(rng, correlation):
     assert not found.additive
     largest = found.products[0]
     assert largest.stages == ("stage 0", "stage 1")
-    assert largest.correlation == pytest.approx(correlation, abs=0.05)
+    assert largest.correlation == pytest.approx(
+        correlation, abs=tolerance("waterfall.correlated.correlation")
+    )
     # The products explain what the stages do not, with the right sign and size.
-    assert found.covariance.estimate == pytest.approx(2 * correlation * 0.03 * 0.02, rel=0.1)
-    assert sum(p.mse.estimate for p in found.products) == pytest.approx(found.covariance.estimate, rel=1e-9)
+    assert found.covariance.estimate == pytest.approx(
+        2 * correlation * 0.03 * 0.02, rel=tolerance("waterfall.correlated.covariance")
+    )
+    assert sum(p.mse.estimate for p in found.products) == pytest.approx(
+        found.covariance.estimate, rel=tolerance("metric.closed_form.rtol")
+    )
     assert f"correlation {largest.correlation:.2f}" in found.explanation
     assert found.explained
     assert ("undo" if correlation < 0 else "add to") in found.explanation
@@ -130,7 +136,8 @@ def test_colour_difference_without_the_bias_of_noise(rng):
     raised = waterfall(plain, MASK, Display()).stages[0].delta_e00.estimate
     found = waterfall(pictures, MASK, Display()).stages[0].delta_e00
     assert len(parts) == 1
-    assert abs(found.estimate - wanted) < 0.5 * abs(raised - wanted)
+    left = abs(found.estimate - wanted) / abs(raised - wanted)
+    assert left < tolerance("waterfall.jackknife.share")
     assert found.low < wanted < found.high
 
 

@@ -12,6 +12,7 @@ from btfref.cli import main
 from btfref.errors import InputError
 from btfref.formats import FORMATS, format_named, identify, import_btf, merl, names, open_source
 from btfref.formats.convert import import_btf as convert
+from btfref.gates import tolerance
 from btfref.numerics.sphere.directions import directions
 from btfref.sampling import SampledBTF, open_store
 
@@ -41,7 +42,9 @@ def test_merl_constant(tmp_path):
     btf = imported(path)
     assert btf.values.shape == (81, 81, 1, 1, 3)
     expected = albedo / np.pi * btf.lights.vectors[:, 2:]
-    np.testing.assert_allclose(btf.values[:, :, 0, 0], np.broadcast_to(expected, (81, 81, 3)), rtol=1e-6)
+    np.testing.assert_allclose(
+        btf.values[:, :, 0, 0], np.broadcast_to(expected, (81, 81, 3)), rtol=tolerance("formats.float32.rtol")
+    )
 
 
 def test_merl_coordinates(tmp_path):
@@ -57,8 +60,11 @@ def test_merl_coordinates(tmp_path):
         half /= np.linalg.norm(half, axis=1, keepdims=True)
         theta_h, theta_d = np.arccos(half[:, 2]), np.arccos(np.clip((half * light).sum(1), -1, 1))
         # Cells of θ_h widen towards the horizon: θ = (i/n)² π/2 has the step π i/n².
-        assert (np.abs(found[:, 0] - theta_h) <= np.pi / 90 * np.sqrt(theta_h / (np.pi / 2)) + 1e-3).all()
-        assert (np.abs(found[:, 1] - theta_d) <= np.pi / 360 + 1e-6).all()
+        cell = np.pi / 90 * np.sqrt(theta_h / (np.pi / 2))
+        assert (np.abs(found[:, 0] - theta_h) <= cell + tolerance("formats.merl_cells.half")).all()
+        assert (
+            np.abs(found[:, 1] - theta_d) <= np.pi / 360 + tolerance("formats.merl_cells.difference")
+        ).all()
 
 
 def test_merl_is_reciprocal_and_isotropic():
@@ -108,7 +114,12 @@ def test_mif(reference, tmp_path):
     path.write_bytes(mif_of(values @ RGB_TO_XYZ.T * 100, reference=reference))
     assert identify(path) == "mif"
     expected = material.stored(values, cosine_included=False, scale=1 / np.pi)
-    np.testing.assert_allclose(imported(path).values, expected, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(
+        imported(path).values,
+        expected,
+        rtol=tolerance("formats.spectral_mif.rtol"),
+        atol=tolerance("formats.spectral_mif.atol"),
+    )
 
 
 def test_mif_index_map_and_types(tmp_path):
@@ -123,7 +134,9 @@ def test_mif_index_map_and_types(tmp_path):
 
     linear = decode_srgb(codes / 255).reshape(values.shape)
     expected = material.stored(linear, cosine_included=False, scale=1 / np.pi)
-    np.testing.assert_allclose(imported(tmp_path / "x.mif").values, expected, rtol=1e-5)
+    np.testing.assert_allclose(
+        imported(tmp_path / "x.mif").values, expected, rtol=tolerance("formats.decoded.rtol")
+    )
 
 
 @pytest.mark.parametrize(

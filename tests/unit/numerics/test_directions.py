@@ -12,6 +12,7 @@ from btfref.numerics.sphere.interpolation import from_arrays
 from btfref.numerics.sphere.parabolic import hemisphere_to_square, solid_angle_density, square_to_hemisphere
 from btfref.numerics.sphere.quadrature import gauss_hemisphere
 
+EXACT = tolerance("interpolation.exact.max")
 NAMES = ("ubo81", "ubo151", "10x5", "16x8", "scattered")
 
 
@@ -31,16 +32,16 @@ def test_ubo81_is_the_measured_order():
     d = directions("ubo81")
     assert len(d) == 81
     np.testing.assert_allclose(
-        np.degrees(d.theta[[0, 1, 7, 19, 37, 57]]), [0, 15, 30, 45, 60, 75], atol=1e-12
+        np.degrees(d.theta[[0, 1, 7, 19, 37, 57]]), [0, 15, 30, 45, 60, 75], atol=EXACT
     )
-    np.testing.assert_allclose(np.degrees(d.phi[[1, 2, 8, 20, 38, 58]]), [0, 60, 30, 20, 18, 15], atol=1e-12)
+    np.testing.assert_allclose(np.degrees(d.phi[[1, 2, 8, 20, 38, 58]]), [0, 60, 30, 20, 18, 15], atol=EXACT)
     np.testing.assert_array_equal(d.rings[:, 2:], [[1, 0], [6, 1], [12, 7], [18, 19], [20, 37], [24, 57]])
 
 
 def test_ubo151_offsets():
     d = directions("ubo151")
     assert len(d) == 151
-    np.testing.assert_allclose(np.degrees(d.rings[:, 1]), [0, 15, 0, 15, 0, 0, 7.5, 0, 7.5, 0], atol=1e-9)
+    np.testing.assert_allclose(np.degrees(d.rings[:, 1]), [0, 15, 0, 15, 0, 0, 7.5, 0, 7.5, 0], atol=EXACT)
 
 
 def test_regular_grid_is_cell_centred():
@@ -106,7 +107,7 @@ def test_lights_fade_to_the_horizon(some):
     held = some.stencil(spherical(np.radians(89.99), phi))[1].sum(-1)
     assert (weight[0] > weight[1]).all()
     assert (weight[1] > weight[2]).all()
-    assert weight[2].max() < 0.01
+    assert weight[2].max() <= tolerance("directions.horizon.weight")
     np.testing.assert_allclose(held, 1, atol=tolerance("interpolation.exact.max"))
 
 

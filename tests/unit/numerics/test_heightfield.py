@@ -38,8 +38,8 @@ def test_every_ray_hits_the_surface_where_it_says(field, rng):
     hit = field.view_hits(uv, w)
     size = [field.shape[1], field.shape[0]]
     place = (hit.cell + hit.local + 0.5) / size
-    np.testing.assert_allclose(field.points(place).height, hit.height, atol=EXACT * 100)
-    assert on_torus(uv + hit.height[:, None] * field.tangents(w), place).max() <= EXACT * 100
+    np.testing.assert_allclose(field.points(place).height, hit.height, atol=tolerance("heightfield.hit"))
+    assert on_torus(uv + hit.height[:, None] * field.tangents(w), place).max() <= tolerance("heightfield.hit")
     assert (hit.height <= field.top).all()
     assert (hit.height >= field.bottom).all()
     assert (np.abs(field.tangents(w)).max(0) * field.depth <= MAXIMUM_TRAVEL * (1 + EXACT)).all()
@@ -53,7 +53,7 @@ def test_no_surface_before_the_hit(field, rng):
     for share in np.linspace(0, 0.999, 200):
         z = field.top + share * (hit.height - field.top)
         below = field.points(np.mod(uv + z[:, None] * tangent, 1)).height
-        assert (z - below >= -EXACT * 100).all()
+        assert (z - below >= -tolerance("heightfield.hit")).all()
 
 
 def test_shadows_are_blocked_points(field, rng):
@@ -68,8 +68,9 @@ def test_shadows_are_blocked_points(field, rng):
         surface = field.points(np.mod(place + rise[:, None] * field.tangents(w), 1)).height
         margin = np.minimum(margin, hit.height + rise - surface)
     # The ray is sampled: what it passes between samples may block it, but nothing that it dips into lets it pass.
-    assert (~lit | (margin > -2e-5 * max(field.depth, 1e-6))).all()
-    certain = margin > 0.05 * field.depth
+    depth = max(field.depth, tolerance("heightfield.shadow.least_depth_parameter"))
+    assert (~lit | (margin > -tolerance("heightfield.shadow.dips") * depth)).all()
+    certain = margin > tolerance("heightfield.shadow.clears") * field.depth
     assert lit[certain].all()
 
 
@@ -97,8 +98,10 @@ def test_slopes_of_a_wave():
     u = (np.arange(n) + 0.5) / n
     field = HeightField(np.tile(0.1 * np.sin(2 * np.pi * u), (8, 1)).astype(np.float32))
     expected = 0.1 * np.cos(2 * np.pi * u) * np.sin(2 * np.pi / n) * n
-    np.testing.assert_allclose(field.slopes[..., 0], np.tile(expected, (8, 1)), atol=1e-5)
-    np.testing.assert_allclose(field.slopes[..., 1], 0, atol=1e-5)
+    np.testing.assert_allclose(
+        field.slopes[..., 0], np.tile(expected, (8, 1)), atol=tolerance("heightfield.slope")
+    )
+    np.testing.assert_allclose(field.slopes[..., 1], 0, atol=tolerance("heightfield.slope"))
 
 
 @pytest.mark.parametrize("f2", [-3.0, -1e-12, 0.0, 1e-12, 3.0])
@@ -107,7 +110,8 @@ def test_first_root(f2, rng):
     q = first_root(f0, f1, np.full(1000, f2))
     there = q < 1e3
     at = q[there]
-    assert np.abs(f0[there] + f1[there] * at + f2 * at * at).max(initial=0) <= EXACT * 1e6
+    residual = np.abs(f0[there] + f1[there] * at + f2 * at * at)
+    assert residual.max(initial=0) <= tolerance("heightfield.root.residual")
     # Positive up to the root.
     for share in np.linspace(0, 0.99, 50):
         s = share * np.minimum(q, 10)
