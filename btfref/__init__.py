@@ -1,26 +1,71 @@
 """Bidirectional texture functions: synthesis, compression, reference and real-time rendering, comparison.
 
-The stages are sub-packages along the data flow: ``mesostructure``, ``sampling``, ``representations``,
-``render``, ``compare``, ``report``. What one uses most is here; `btfref.rendering.offline.reference.render`,
-`btfref.rendering.gl.renderer.realtime` and `btfref.comparison.comparison.compare` stand where they belong. Importing
-btfref loads nothing but the standard library; each stage brings in what it needs when it is used.
+>>> import btfref
+>>> btf = btfref.synthesize("checker", texels=64, views="ubo81", lights="ubo81", spp=16)
+>>> lpca = btfref.fit("lpca", btf, clusters=16, components=4)
+>>> btfref.save(lpca, "checker.lpca.exr")
+>>> reference = btfref.render("plane", parameters={"btf": "checker.lpca.exr"}, noise_free=4, shadows=False)
+>>> image = btfref.realtime("plane", parameters={"btf": "checker.lpca.exr"}, grid=4)
+>>> btfref.compare(image, reference, gate="image.noise_free").passed
+True
+
+Importing btfref loads nothing but the standard library; each name brings in what it needs when it is first used.
 """
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 from btfref.provenance import __version__
 
-__all__ = ["__version__", "fit", "load", "save", "synthesize"]
+if TYPE_CHECKING:
+    from btfref.comparison import compare
+    from btfref.numerics.sphere.directions import DirectionSet
+    from btfref.rendering.gl.renderer import realtime
+    from btfref.rendering.offline.reference import render
+    from btfref.representations.protocol import Representation
+    from btfref.sampling import SampledBTF
+    from btfref.sampling.synthesis import synthesize
+    from btfref.types import PathLike, Progress
+
+__all__ = [
+    "DirectionSet",
+    "SampledBTF",
+    "__version__",
+    "compare",
+    "fit",
+    "load",
+    "realtime",
+    "render",
+    "save",
+    "synthesize",
+]
+
+#: Where what is not defined here comes from.
+_HOMES = {
+    "DirectionSet": "btfref.numerics.sphere.directions",
+    "SampledBTF": "btfref.sampling",
+    "compare": "btfref.comparison",
+    "realtime": "btfref.rendering.gl.renderer",
+    "render": "btfref.rendering.offline.reference",
+    "synthesize": "btfref.sampling.synthesis",
+}
 
 
-def synthesize(mesostructure="checker", **settings):
-    """Path trace a mesostructure into a sampled BTF: `btfref.sampling.synthesis.synthesize`."""
-    from btfref.sampling.synthesis import synthesize as run
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'btfref' has no attribute {name!r}")
+    from importlib import import_module
 
-    return run(mesostructure, **settings)
+    found = globals()[name] = getattr(import_module(_HOMES[name]), name)
+    return found
 
 
-def load(path):
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})
+
+
+def load(path: PathLike) -> SampledBTF | Representation:
     """Read a sampled BTF (a ``.btf.zarr`` folder) or a representation (an ``.exr`` file).
 
     Parameters
@@ -47,7 +92,15 @@ def load(path):
     return read(path)
 
 
-def fit(method, btf, *, seed=0, progress=None, **parameters):
+def fit(
+    method: str,
+    btf: SampledBTF,
+    *,
+    preset: str | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+    **parameters: Any,
+) -> Representation:
     """Compress a sampled BTF.
 
     Parameters
@@ -55,12 +108,14 @@ def fit(method, btf, *, seed=0, progress=None, **parameters):
     method : str
         Key of the method, such as "lpca"; see ``btfref.registry.methods()``.
     btf : SampledBTF
+    preset : str, optional
+        Named settings, such as "paper"; `parameters` go before them.
     seed : int
         Same seed, same bytes (on the same machine).
     progress : callable, optional
         Called as ``progress(done, total, label)``.
     **parameters
-        Of the method.
+        Of the method: ``btfref fit METHOD --help`` lists them.
 
     Returns
     -------
@@ -69,15 +124,31 @@ def fit(method, btf, *, seed=0, progress=None, **parameters):
     Raises
     ------
     InputError
-        For an unknown method or a parameter out of range.
+        For an unknown method, preset or parameter, or one that is out of range.
     """
     from btfref.registry import method as row
 
-    return row(method).fit(btf, seed=seed, progress=progress, **parameters)
+    found = row(method)
+    return found.fit(btf, seed=seed, progress=progress, **found.settings(preset, parameters))
 
 
-def save(representation, path):
-    """Write a representation as one OpenEXR file: `btfref.representations.file.container.save`."""
+def save(data: SampledBTF | Representation, path: PathLike) -> None:
+    """Write a sampled BTF (a ``.btf.zarr`` folder, a new one) or a representation (one OpenEXR file).
+
+    Parameters
+    ----------
+    data : SampledBTF or Representation
+    path : path-like
+
+    Raises
+    ------
+    InputError
+        When a folder of that name is there, or a value cannot be stored.
+    """
     from btfref.representations.file.container import save as write
+    from btfref.sampling import SampledBTF
 
-    write(representation, path)
+    if isinstance(data, SampledBTF):
+        data.save(path)
+    else:
+        write(data, path)

@@ -15,7 +15,9 @@ last ring
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 
@@ -36,6 +38,29 @@ UNITS = "1/sr"
 
 #: Texel filters, named as in Mitsuba's ``bitmap``.
 FILTER_TYPES = ("nearest", "bilinear")
+
+
+def in_one_line(
+    kind: str, texels: Sequence[int], views: Mapping[str, Any], lights: Mapping[str, Any], size: int
+) -> str:
+    """The ``repr`` of a BTF, a store or a representation, whatever it holds.
+
+    Parameters
+    ----------
+    kind : str
+        The class, and the key of a method or the type of the values.
+    texels : (int, int)
+        Rows and columns.
+    views, lights : mapping
+        ``count`` of the directions and ``name`` of their set.
+    size : int
+        Bytes of the maps or values alone, as ``btfref info`` counts them.
+    """
+    sets = " × ".join(
+        f"{d['count']} {what} ({d['name']})" for what, d in (("views", views), ("lights", lights))
+    )
+    return f"<{kind}: {texels[0]} × {texels[1]} texels, {sets}, {size} bytes>"
+
 
 #: Coefficients of the luminance of linear Rec. 709 (ITU-R BT.709-6, item 3.2).
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])

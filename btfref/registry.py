@@ -7,7 +7,9 @@ from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
+from inspect import signature
 from pathlib import Path
+from typing import Any
 
 from btfref.errors import InputError
 
@@ -84,6 +86,38 @@ class Method:
         spec = find_spec(top) if top else None
         roots = spec.submodule_search_locations if spec else None
         return Path(roots[0], *inner, "tolerances.toml") if roots else None
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The parameters of ``fit`` that are the method's own, with their defaults."""
+        found = signature(self.fit).parameters.values()
+        return {p.name: p.default for p in found if p.name not in ("btf", "seed", "progress")}
+
+    def settings(self, preset: str | None, given: dict[str, Any]) -> dict[str, Any]:
+        """Parameters of a fit: those of a preset, overridden by the given ones.
+
+        Raises
+        ------
+        InputError
+            For a preset or a parameter that the method does not have.
+        """
+        if preset is not None and preset not in self.presets:
+            raise InputError(
+                f"{self.key} has no such preset",
+                field="preset",
+                got=repr(preset),
+                expected=f"one of {', '.join(self.presets)}",
+            )
+        known = self.parameters
+        for name in given:
+            if name not in known:
+                raise InputError(
+                    f"{self.key} has no such parameter",
+                    field="parameter",
+                    got=repr(name),
+                    expected=f"one of {', '.join(known)}" if known else "none",
+                )
+        return (self.presets[preset] if preset is not None else {}) | given
 
     @property
     def editor(self):

@@ -5,11 +5,13 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
+
 from btfref.commands._shared import Progress, assignments, bytes_text, count, emit, emit_json, output_file
 from btfref.errors import InputError
 
 
-def add_arguments(parser):
+def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
     parser.add_argument("method", metavar="METHOD", help="key of the method, e.g. lpca")
     parser.add_argument("btf", metavar="BTF", help="a sampled BTF (.btf.zarr)")
@@ -35,7 +37,7 @@ def add_arguments(parser):
     parser.add_argument("--json", action="store_true", help="print the facts of the file as JSON")
 
 
-def run(args):
+def run(args: Namespace) -> int:
     """Carry the command out."""
     from btfref.registry import method
 
@@ -44,7 +46,7 @@ def run(args):
     given = assignments(args.set)
     if args.target_error is not None:
         given["target_error"] = args.target_error
-    parameters = fit_parameters(row, args.preset, given)
+    parameters = row.settings(args.preset, given)
 
     from btfref.representations.file.container import read_info, save
     from btfref.representations.protocol import FitsPartially
@@ -66,39 +68,3 @@ def run(args):
     else:
         emit(f"{out}: {info['method']}, maps {bytes_text(info['payload_bytes'])}, 1:{info['ratio']:.3g}")
     return 0
-
-
-def fit_parameters(row, preset, given):
-    """Parameters of a fit: those of the preset, overridden by the given ones.
-
-    Parameters
-    ----------
-    row : btfref.registry.Method
-    preset : str or None
-    given : dict
-
-    Raises
-    ------
-    InputError
-        For a preset or a parameter that the method does not have.
-    """
-    import inspect
-
-    parameters = {}
-    if preset is not None:
-        if preset not in row.presets:
-            expected = f"one of {', '.join(row.presets)}"
-            raise InputError(
-                f"{row.key} has no such preset", field="--preset", got=repr(preset), expected=expected
-            )
-        parameters.update(row.presets[preset])
-    known = [
-        name for name in inspect.signature(row.fit).parameters if name not in ("btf", "seed", "progress")
-    ]
-    for name in given:
-        if name not in known:
-            expected = f"one of {', '.join(known)}" if known else "none"
-            raise InputError(
-                f"{row.key} has no such parameter", field="--set", got=repr(name), expected=expected
-            )
-    return parameters | given

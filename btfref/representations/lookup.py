@@ -42,6 +42,14 @@ class StoredMaps:
     maps: dict
     meta: dict
 
+    def __repr__(self) -> str:
+        from btfref.representations.file.container import payload_bytes
+
+        meta = self.meta
+        size = payload_bytes({name: (a.shape, str(a.dtype)) for name, a in self.maps.items()}, meta)
+        kind = f"Representation {meta['method']}"
+        return conventions.in_one_line(kind, meta["texels"], meta["views"], meta["lights"], size)
+
     def arrays(self):
         """All maps and the direction tables, as they are stored."""
         return self.maps
@@ -166,8 +174,8 @@ def meta_for(method, texels, views, lights, parameters, *, filter_type="bilinear
     return {
         "method": method,
         "texels": [int(n) for n in texels],
-        "views": {"name": views.name, "count": len(views)},
-        "lights": {"name": lights.name, "count": len(lights)},
+        "views": views.facts,
+        "lights": lights.facts,
         "filter_type": filter_type,
         "parameters": parameters,
         "parent": dict(parent or {}),

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from btfref.errors import InputError
+from btfref.scene.shipped import scene_file
 
 #: The BSDF plugin that shows a representation.
 BTF = "btf"
@@ -120,7 +121,7 @@ def parse(scene, parameters=None, *, variant, size=None, missing_btf=False):
     Parameters
     ----------
     scene : path-like or dict
-        Mitsuba XML file or scene dictionary.
+        Mitsuba XML file, name of a shipped scene, or scene dictionary.
     parameters : dict of str to str, optional
         Values for ``$name`` in the file.
     variant : str
@@ -148,11 +149,13 @@ def parse(scene, parameters=None, *, variant, size=None, missing_btf=False):
     config.merge_meshes = False
     parameters = {key: str(value) for key, value in (parameters or {}).items()}
     is_dict = isinstance(scene, dict)
+    if not is_dict:
+        scene = scene_file(scene)
     source = "scene dictionary" if is_dict else str(scene)
     if is_dict and parameters:
         raise InputError("only scene files have parameters", field="parameters", got=", ".join(parameters))
     if not is_dict and not Path(scene).is_file():
-        raise InputError("no such scene file", file=source)
+        raise InputError("a folder, not a scene", file=source)
     try:
         if is_dict:
             state = mi.parser.parse_dict(config, scene)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.errors import InputError
 from btfref.numerics.sphere import interpolation
@@ -37,7 +38,7 @@ RING_TOLERANCE = 2e-6
 
 @dataclass(frozen=True, eq=False)
 class DirectionSet:
-    """Directions of a sampled BTF.
+    """Directions of a sampled BTF; `DirectionSet.of` makes and checks one.
 
     Parameters
     ----------
@@ -50,6 +51,11 @@ class DirectionSet:
     vectors: np.ndarray
     name: str = "custom"
 
+    @classmethod
+    def of(cls, spec: DirectionSet | str | ArrayLike) -> DirectionSet:
+        """A set by its name ("ubo81", "10x5", …) or of vectors: see :func:`directions`."""
+        return directions(spec)
+
     def __len__(self):
         return len(self.vectors)
 
@@ -57,6 +63,14 @@ class DirectionSet:
         return isinstance(other, DirectionSet) and np.array_equal(self.vectors, other.vectors)
 
     __hash__ = None
+
+    def __repr__(self) -> str:
+        return f"<DirectionSet {self.name}: {len(self)} directions>"
+
+    @property
+    def facts(self) -> dict[str, int | str]:
+        """``name`` and ``count``, as files keep them."""
+        return {"name": self.name, "count": len(self)}
 
     @property
     def theta(self):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from btfref.conventions import in_one_line
 from btfref.errors import InputError
 from btfref.numerics.sphere.directions import checked
 from btfref.outputs import refuse_existing, require_folder_of
@@ -127,6 +128,11 @@ class BTFStore:
             raise InputError(
                 "variance and values do not fit", file=self.path, field="variance", got=self._variance.shape
             )
+
+    def __repr__(self) -> str:
+        kind = f"BTFStore {self.dtype}"
+        size = int(np.prod(self._values.shape, dtype=np.int64)) * self.dtype.itemsize
+        return in_one_line(kind, self.texels, self.views.facts, self.lights.facts, size)
 
     def _guard(self, field, action):
         """Whatever Zarr makes of a damaged file becomes one clear line."""

@@ -14,7 +14,6 @@ import pytest
 
 from btfref.cli import build_parser, main
 from btfref.commands import COMMANDS, _shared
-from btfref.commands.fit import fit_parameters
 from btfref.errors import BtfrefError, InputError, MissingDependencyError
 from btfref.gates import tolerance
 from btfref.numerics.sphere.directions import directions
@@ -233,13 +232,13 @@ def test_classes_survive_a_file(tmp_path):
 
 def test_fit_parameters():
     row = method("lpca")
-    assert fit_parameters(row, None, {"clusters": 3}) == {"clusters": 3}
-    paper = fit_parameters(row, "paper", {"clusters": 3})
+    assert row.settings(None, {"clusters": 3}) == {"clusters": 3}
+    paper = row.settings("paper", {"clusters": 3})
     assert paper == {**row.presets["paper"], "clusters": 3}
     with pytest.raises(InputError, match=r"cluster_count.*clusters"):
-        fit_parameters(row, None, {"cluster_count": 3})
+        row.settings(None, {"cluster_count": 3})
     with pytest.raises(InputError, match="paper"):
-        fit_parameters(row, "papers", {})
+        row.settings("papers", {})
 
 
 def test_versions_name_what_is_not_installed():
