@@ -177,7 +177,7 @@ class _Chain:
 
         path, parameters = self.arguments(method, scene, lights)
         with self.timed("reference"):
-            result = render(path, parameters=parameters, noise_free=GRID, shadows=False)
+            result = render(path, parameters=parameters, grid=GRID, shadows=False)
             if scene not in self.classes:
                 self.classes[scene] = pixel_classes(path, parameters=parameters, grid=GRID)
         self.renderers["reference"] = result.meta

@@ -201,7 +201,7 @@ def _pictures(folder, name, size):
         save(made, path)
         maps.append(made.maps["values"].nbytes)
         files.append(path.stat().st_size)
-        shown = render(scene_file(scene), parameters=parameters | {"btf": str(path)}, noise_free=2, size=size)
+        shown = render(scene_file(scene), parameters=parameters | {"btf": str(path)}, grid=2, size=size)
         images.append(shown.image)
     return {
         "share_of_map_bytes": maps[0] / maps[1],

@@ -40,9 +40,7 @@ def add_arguments(parser):
         "-D", dest="define", action="append", metavar="KEY=VALUE", help="parameter of the scene"
     )
     scene.add_argument("--size", type=size, metavar="WxH", help="of the film (default: the picture's)")
-    scene.add_argument(
-        "--noise-free", type=count(1), default=4, metavar="N", help="N × N grid per pixel (default: 4)"
-    )
+    scene.add_argument("--grid", type=count(1), default=4, metavar="N", help="N × N sub-pixels (default 4)")
     scene.add_argument("--shadows", action="store_true", help="the picture has cast shadows")
     scene.add_argument("--cache", metavar="FOLDER", help="of references (default: the user's cache)")
     parser.add_argument("--json", action="store_true", help="print metrics and gates as JSON")
@@ -98,7 +96,7 @@ def _against_scene(args, test):
         args.reference,
         parameters=parameters,
         size=args.size or (test.shape[1], test.shape[0]),
-        grid=args.noise_free,
+        grid=args.grid,
         shadows=args.shadows,
         cache=args.cache,
     )

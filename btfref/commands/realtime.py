@@ -36,10 +36,10 @@ def add_arguments(parser):
     parser.add_argument("--grid", type=count(1), default=4, metavar="N", help="N × N sub-pixels (default 4)")
     parser.add_argument("--size", type=size, metavar="WxH", help="of the image, in pixels")
     parser.add_argument(
-        "--views",
+        "--keep",
         choices=("all", "needed"),
         default="all",
-        help="measured views to keep in memory: all, or those that the camera can see",
+        help="maps to load: all, or those that the camera's first hits need",
     )
     parser.add_argument(
         "--environment", choices=PATHS, default="auto", help="how an envmap lights (default auto)"
@@ -95,7 +95,7 @@ def run(args):
         parameters=parameters,
         grid=args.grid,
         size=args.size,
-        views=args.views,
+        keep=args.keep,
         environment=args.environment,
         lights=args.lights,
         order=args.order,

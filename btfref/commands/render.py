@@ -1,8 +1,8 @@
 """Render a Mitsuba scene: the reference image.
 
 SCENE is a Mitsuba XML file, or one of the scenes that btfref ships: plane, sphere, cloth, bowl, horizon, turning.
-Any integrator; the film becomes float32 with a box filter. Where all lights are directional or points,
---noise-free N evaluates the material on a regular N × N grid in each pixel, without random numbers.
+Any integrator; the film becomes float32 with a box filter. --grid N takes direct light alone, on a regular grid of
+N × N positions in each pixel: without random numbers where all lights are directional or points.
 --geometry shows the truth beyond every representation: the flat shape replaced by the mesostructure itself,
 path traced.
 """
@@ -27,11 +27,11 @@ def add_arguments(parser):
     parser.add_argument("--seed", type=count(0), default=0, metavar="N")
     parser.add_argument("--variant", default="llvm_ad_rgb", metavar="NAME", help="Mitsuba variant")
     parser.add_argument(
-        "--noise-free", type=count(1), metavar="N", help="regular N × N grid per pixel, delta lights"
+        "--grid", type=count(1), metavar="N", help="direct light on a regular grid of N × N sub-pixels"
     )
     parser.add_argument("--no-shadows", action="store_true", help="direct light without cast shadows")
     parser.add_argument(
-        "--maps",
+        "--keep",
         choices=("all", "needed"),
         default="all",
         help="maps to load: all, or those that the camera's first hits need",
@@ -47,8 +47,8 @@ def run(args):
     """Carry the command out."""
     scene, out = scene_file(args.scene), output_file(args.output, ".exr")
     parameters = assignments(args.define, convert=str, option="-D")
-    if args.geometry and args.noise_free is not None:
-        raise InputError("geometry is path traced", field="--geometry", got="--noise-free")
+    if args.geometry and args.grid is not None:
+        raise InputError("geometry is path traced", field="--geometry", got="--grid")
     classes_out = output_file(args.classes, ".png") if args.classes else None
 
     if args.geometry:
@@ -65,10 +65,10 @@ def run(args):
             variant=args.variant,
             spp=args.spp,
             seed=args.seed,
-            noise_free=args.noise_free,
+            grid=args.grid,
             shadows=not args.no_shadows,
             size=args.size,
-            maps=args.maps,
+            keep=args.keep,
             debug=args.debug,
         )
     if lost := result.meta.get("not_finite"):
@@ -77,6 +77,6 @@ def run(args):
     if classes_out:
         from btfref.scene.pixel_classes import pixel_classes
 
-        classes = pixel_classes(scene, parameters=parameters, size=args.size, grid=args.noise_free or 4)
+        classes = pixel_classes(scene, parameters=parameters, size=args.size, grid=args.grid or 4)
     write_images(result.image, out, png=args.png, classes=classes, classes_out=classes_out)
     return 0

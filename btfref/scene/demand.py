@@ -16,6 +16,9 @@ import numpy as np
 from btfref.errors import InputError
 from btfref.scene.first_hits import MARGIN, Touched, light_directions
 
+#: Which maps of a file renderers load.
+KEEP = ("all", "needed")
+
 #: Levels of detail by which a footprint may be off.
 LEVEL_MARGIN = 0.01
 
@@ -167,11 +170,12 @@ def demand(
     return {name: Demand(name, *found.result(from_everywhere, indirect)) for name, found in wanted.items()}
 
 
-def kept_maps(scene, parameters=None, *, lights=True, **settings):
-    """The maps that a scene needs, as :func:`btfref.representations.load` takes them.
+def kept_maps(keep, scene, parameters=None, *, lights=True, **settings):
+    """The maps of a scene's files that a renderer loads, as :func:`btfref.representations.load` takes them.
 
     Parameters
     ----------
+    keep : {"all", "needed"}
     scene, parameters, **settings
         As for :func:`demand`.
     lights : bool
@@ -181,10 +185,28 @@ def kept_maps(scene, parameters=None, *, lights=True, **settings):
     -------
     dict of str to dict
         By file: "views", "lights", "entries", "levels": arrays of int, or None where the method keeps no maps by them.
+        Empty where all are kept.
+
+    Raises
+    ------
+    InputError
+        For another word, or a scene that cannot be read.
     """
+    if keep not in KEEP:
+        raise InputError("unknown choice of maps", field="keep", got=keep, expected=" or ".join(KEEP))
+    if keep == "all":
+        return {}
     return {
         file: choice(one, lights=lights)
         for file, one in demand(scene, parameters=parameters, **settings).items()
+    }
+
+
+def number_kept(kept):
+    """How many maps are kept, by file and by what was chosen."""
+    return {
+        file: {kind: len(chosen) for kind, chosen in choices.items() if chosen is not None}
+        for file, choices in kept.items()
     }
 
 

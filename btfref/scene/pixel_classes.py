@@ -6,6 +6,7 @@ import numpy as np
 
 from btfref.conventions import PixelClass
 from btfref.scene.camera import film_rays, grid_offsets
+from btfref.scene.lights import is_delta
 from btfref.scene.loading import loaded
 
 #: A step between neighbouring samples that leaves the tangent plane by more than this share of a pixel's
@@ -89,8 +90,7 @@ def _displaced_edges(scene, grid):
 
     if not any(is_displaced(shape.bsdf()) for shape in scene.shapes()):
         return False
-    delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
-    lights = [light for light in scene.emitters() if int(light.flags()) & int(delta)]
+    lights = [light for light in scene.emitters() if is_delta(light)]
     sensor = scene.sensors()[0]
     width, height = (int(k) for k in sensor.film().crop_size())
     spread, largest = np.zeros((2, width * height))

@@ -206,7 +206,7 @@ def _under_deltas(path, spec, views, settings, shared):
 
     scene = {name: shared[name] for name in ("parameters", "size")}
     definition = approximate(path, **shared)
-    reference = render(path, noise_free=shared["grid"], shadows=False, **scene)
+    reference = render(path, grid=shared["grid"], shadows=False, **scene)
     image = realtime(path, **shared)
     chain = [("fit", definition.image), ("port", reference.image), ("real time", image.image)]
     return [Picture(name, picture[None]) for name, picture in chain], reference, image, GATES, {}, ()

@@ -98,7 +98,7 @@ class Bench:
         if subject not in self._references:
             scene, size, grid = scene_file(SCENE), SETTINGS["size"], SETTINGS["grid"]
             parameters = {"btf": str(self.fit(subject)[1]), "lights": LIGHTS, "tiling": "4"}
-            image = render(scene, parameters=parameters, noise_free=grid, shadows=False, size=size).image
+            image = render(scene, parameters=parameters, grid=grid, shadows=False, size=size).image
             classes = pixel_classes(scene, parameters=parameters, grid=grid, size=size)
             self._references[subject] = scene, parameters, image, classes
         return self._references[subject]

@@ -104,7 +104,7 @@ def _render(path, parameters, size, grid, shadows, spp, delta):
     shared = {"parameters": parameters, "size": size}
     made = {"classes": pixel_classes(path, grid=grid, **shared)}
     if delta:
-        return made | {"image": render(path, noise_free=grid, shadows=shadows, **shared).image}
+        return made | {"image": render(path, grid=grid, shadows=shadows, **shared).image}
     result = render(path, spp=spp, with_variance=True, **shared)
     return made | {"image": result.image, "variance": result.variance}
 

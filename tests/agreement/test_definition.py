@@ -37,7 +37,7 @@ def test_the_reference_is_the_definition_in_float32(fits, key):
     scene, parameters = scene_file("cloth"), {"btf": str(fits.path(key)), "lights": "points2"}
     shared = {"parameters": parameters, "grid": 2, "size": SIZE}
     expected = approximate(scene, **shared)
-    image = render(scene, parameters=parameters, noise_free=2, shadows=False, size=SIZE)
+    image = render(scene, parameters=parameters, grid=2, shadows=False, size=SIZE)
     comparison = compare(
         image, expected, classes=pixel_classes(scene, **shared), gate="image.float64", flip=False
     )

@@ -77,7 +77,7 @@ def test_several_files_texture_transforms_scale_and_both_sides(llvm, tmp_path):
     scene = room(llvm, shapes=shapes, lights=LIGHTS)
     described = read_scene(scene)
     image = realtime(described, grid=GRID)
-    expected = render(scene, noise_free=GRID, shadows=False)
+    expected = render(scene, grid=GRID, shadows=False)
     comparison = compare(image, expected, classes=pixel_classes(scene, grid=GRID), gate=GATES, flip=False)
     assert comparison.passed, [gate.line for gate in comparison.gates if not gate.passed]
 
@@ -126,7 +126,7 @@ def test_lambert_is_mitsubas_diffuse(llvm, tmp_path, monkeypatch, shape, twoside
 
     image = realtime(scene({"type": "btf", "filename": str(tmp_path / "any.exr")}), grid=GRID)
     plain = scene({"type": "diffuse"})
-    expected = render(plain, noise_free=GRID, shadows=False)
+    expected = render(plain, grid=GRID, shadows=False)
     classes = pixel_classes(plain, grid=GRID)
     assert (expected.image[classes == PixelClass.INTERIOR].max(-1) > 0).any()
     comparison = compare(
@@ -145,13 +145,24 @@ def test_shadows_can_be_left_out(llvm):
         "flat": {"type": "rectangle", "to_world": transform().translate([0, 0, 0.9]).scale(0.2)},
     }
     scene = room(llvm, shapes=shapes, lights=LIGHTS, size=(48, 48))
-    lit = render(scene, noise_free=2, shadows=False).image
-    shadowed = render(scene, noise_free=2).image
+    lit = render(scene, grid=2, shadows=False).image
+    shadowed = render(scene, grid=2).image
     assert (shadowed <= lit).all()
     assert (shadowed < 0.9 * lit).mean() > 0.02
     traced = render(scene, spp=256, seed=3, with_variance=True)
-    comparison = compare(traced, render(scene, noise_free=16), gate="image.difference", flip=False)
+    comparison = compare(traced, render(scene, grid=16), gate="image.difference", flip=False)
     assert comparison.passed, [gate.line for gate in comparison.gates if not gate.passed]
+
+
+def test_a_regular_grid_is_random_under_an_environment_only(llvm):
+    llvm.set_variant("scalar_rgb")
+    sphere, sky = {"a": {"type": "sphere"}}, {"sky": {"type": "constant"}}
+    exact = render(room(llvm, shapes=sphere, lights=LIGHTS, size=(16, 16)), grid=2, spp=64)
+    assert (exact.variance, exact.pictures, exact.meta["grid"]) == (None, None, 2)
+    noisy = render(room(llvm, shapes=sphere, lights=sky, size=(16, 16)), grid=2, spp=64)
+    assert noisy.variance.max() > 0
+    assert noisy.pictures.shape == (4, 16, 16, 3)
+    assert (noisy.meta["grid"], noisy.meta["spp"]) == (2, 64)
 
 
 def test_same_seed_same_image(llvm):
@@ -213,8 +224,9 @@ def test_realtime_refuses_what_it_cannot_show(llvm):
         realtime(room(llvm, shapes=sphere, lights=LIGHTS))
     with pytest.raises(InputError, match="grid"):
         realtime(room(llvm, shapes={}, lights=LIGHTS), grid=0)
-    with pytest.raises(InputError, match="delta"):
-        render(room(llvm, shapes=sphere, lights={"sky": {"type": "constant"}}), noise_free=1)
+    lamp = {"a": {"type": "sphere", "emitter": {"type": "area"}}}
+    with pytest.raises(InputError, match="delta lights or an environment"):
+        render(room(llvm, shapes=lamp, lights=LIGHTS), grid=1)
     bare = room(llvm, shapes=sphere, lights=LIGHTS)
     del bare["integrator"]
     with pytest.raises(InputError, match="integrator"):
@@ -222,4 +234,4 @@ def test_realtime_refuses_what_it_cannot_show(llvm):
     with pytest.raises(InputError, match="variant"):
         render(room(llvm, shapes=sphere, lights=LIGHTS), variant="scalar_float")
     with pytest.raises(InputError, match="JIT"):
-        render(room(llvm, shapes=sphere, lights=LIGHTS), variant="scalar_rgb", noise_free=1)
+        render(room(llvm, shapes=sphere, lights=LIGHTS), variant="scalar_rgb", grid=1)

@@ -85,7 +85,7 @@ def reference(saved, classes_of):
         if case not in made:
             path = files("btfref.scene.shipped").joinpath(f"{name}.xml")
             parameters = {"btf": saved(key), "lights": lights, "tiling": "4"}
-            image = render(path, parameters=parameters, noise_free=grid, shadows=False, size=size)
+            image = render(path, parameters=parameters, grid=grid, shadows=False, size=size)
             made[case] = path, parameters, image, classes_of(name, path, parameters, grid, size)
         return made[case]
 

@@ -195,7 +195,7 @@ def test_both_renderers_show_the_same_levels(made, llvm, need, scene, more):
     _, path = made("default")
     file, parameters = scene_file(scene), {"btf": str(path), **more}
     settings = {"size": (96, 64), "parameters": parameters}
-    expected = render(file, noise_free=1, shadows=False, **settings)
+    expected = render(file, grid=1, shadows=False, **settings)
     classes = pixel_classes(file, grid=1, **settings)
     image = realtime(file, grid=1, **settings)
     comparison = compare(image, expected, classes=classes, gate=GATES, flip=False)

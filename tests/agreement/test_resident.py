@@ -242,14 +242,12 @@ def test_a_picture_needs_some_views_only(need, fits, tmp_path, capsys):
     need("gl")
     parameters = {"btf": str(fits.path("rf_lobes")), "lights": "directional3", "tiling": "3"}
     whole = realtime(PLANE, parameters=parameters, grid=2, size=(64, 64))
-    some = realtime(PLANE, parameters=parameters, grid=2, size=(64, 64), views="needed")
+    some = realtime(PLANE, parameters=parameters, grid=2, size=(64, 64), keep="needed")
     np.testing.assert_array_equal(some.image, whole.image)
-    (kept,) = some.meta["resident_views"].values()
-    assert 3 <= kept < 60
+    (kept,) = some.meta["kept"].values()
+    assert 3 <= kept["views"] < 60
     assert some.meta["not_finite"] == 0
     out = tmp_path / "plane.exr"
     arguments = [f"-D{key}={value}" for key, value in parameters.items()]
-    assert (
-        main(["realtime", "plane", "-o", str(out), "--size", "32x32", "--views", "needed", *arguments]) == 0
-    )
+    assert main(["realtime", "plane", "-o", str(out), "--size", "32x32", "--keep", "needed", *arguments]) == 0
     assert out.exists()

@@ -95,7 +95,7 @@ def both_pictures(mi, fitted, folder, **parameters):
     save(fitted, folder / "a.cmf.exr")
     scene = plane(mi, {"type": "btf", "filename": str(folder / "a.cmf.exr"), **parameters})
     assert (pixel_classes(scene, grid=GRID) == PixelClass.INTERIOR).all()
-    return render(scene, noise_free=GRID, shadows=False), realtime(scene, grid=GRID)
+    return render(scene, grid=GRID, shadows=False), realtime(scene, grid=GRID)
 
 
 @pytest.mark.parametrize("storage", ["half", "byte"])
@@ -115,7 +115,7 @@ def test_a_picture_blends_four_texels_like_a_bitmap(llvm, need, rng, tmp_path):
     fitted = as_ones(fit(oracle_btf((6, 5)), clusters=None, storage="float"), colours)
     bitmap = {"type": "bitmap", "bitmap": llvm.Bitmap(colours), "raw": True}
     bitmap |= {"format": "variant", "accel": False}
-    expected = render(plane(llvm, {"type": "diffuse", "reflectance": bitmap}), noise_free=GRID, shadows=False)
+    expected = render(plane(llvm, {"type": "diffuse", "reflectance": bitmap}), grid=GRID, shadows=False)
     cosine = LIGHT[2] / np.linalg.norm(LIGHT)
     expected = dataclasses.replace(expected, image=(expected.image * (np.pi / cosine)).astype(np.float32))
     for picture in both_pictures(llvm, fitted, tmp_path):

@@ -102,7 +102,7 @@ def test_measured_style(tmp_path, monkeypatch, capsys):
             "a.exr",
             "-D",
             "btf=m.exr",
-            "--noise-free",
+            "--grid",
             "4",
             "--no-shadows",
             *classes,

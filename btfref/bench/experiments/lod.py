@@ -97,13 +97,11 @@ def _moving(scene, path, frames, grid, tell):
     for frame in range(frames):
         tell(frame, frames, scene)
         parameters = {"btf": path, moved: str(frame * step)}
-        truth.append(
-            render(file, parameters=parameters | {"lod": "none"}, noise_free=grid, shadows=False).image
-        )
+        truth.append(render(file, parameters=parameters | {"lod": "none"}, grid=grid, shadows=False).image)
         for kind in kinds:
             own = parameters | {"lod": kind}
             pictures[kind, "GLSL"].append(realtime(file, parameters=own, grid=1).image)
-            pictures[kind, "Mitsuba"].append(render(file, parameters=own, noise_free=1, shadows=False).image)
+            pictures[kind, "Mitsuba"].append(render(file, parameters=own, grid=1, shadows=False).image)
     truth = np.stack(truth).astype(float)
     seen = (truth != 0).any(-1)
     mean = truth[seen].mean()

@@ -2,7 +2,7 @@
 
 Direct light of directional and point lights and of an environment
 (:mod:`btfref.rendering.environment_light.lighting`), without cast shadows; the environment itself is not drawn. The
-sub-pixel grid is the one of the noise-free reference (:mod:`btfref.rendering.offline.reference`): n × n regular
+sub-pixel grid is that of :mod:`btfref.rendering.offline.reference`: n × n regular
 samples a pixel, box filter. Each sample is one frame with a shifted projection; frames are added in float64.
 """
 
@@ -24,7 +24,7 @@ from btfref.rendering.gl.raster import (
     world_to_clip,
 )
 from btfref.rendering.result import RenderResult
-from btfref.scene.demand import MARGIN, kept_maps
+from btfref.scene.demand import MARGIN, kept_maps, number_kept
 from btfref.scene.description import SceneDescription, read_scene
 
 
@@ -34,7 +34,7 @@ def realtime(
     parameters=None,
     grid=4,
     size=None,
-    views="all",
+    keep="all",
     environment="auto",
     lights=None,
     order=None,
@@ -53,7 +53,7 @@ def realtime(
         n of the n × n sub-pixel samples, at (i + ½)/n.
     size : (int, int), optional
         Width and height in place of the scene's.
-    views : {"all", "needed"}
+    keep : {"all", "needed"}
         "needed" keeps only the maps in memory that the camera's first hits need: views, lights, levels of detail,
         entries of codebooks; the picture is the same. Asks Mitsuba for the camera's rays; not for a `SceneDescription`.
     environment : str
@@ -75,8 +75,8 @@ def realtime(
         A sample's footprint, and so the level of detail of methods that have levels, is that of 1/n of a pixel.
         ``meta["frame_ms"]`` is the median time of one frame (one sample a pixel), GPU timer and wall clock
         whichever is longer; ``gl_vendor``, ``gl_renderer``, ``gl_version``; ``negative_fraction``, the share
-        of channels below zero, and ``not_finite``, their number: nothing is clamped; ``resident_views``, the number
-        of views kept by file. With an environment ``environment_path``, the way taken, and what it says of itself,
+        of channels below zero, and ``not_finite``, their number: nothing is clamped; ``kept``, how many maps
+        were kept by file. With an environment ``environment_path``, the way taken, and what it says of itself,
         such as ``environment_lights`` and their ``estimated_error``; by file where there are several.
 
     Raises
@@ -89,13 +89,9 @@ def realtime(
     """
     if grid < 1:
         raise InputError("the sub-pixel grid needs a sample", field="grid", got=grid, expected="≥ 1")
-    if views not in ("all", "needed"):
-        raise InputError("unknown choice of views", field="views", got=views, expected="all or needed")
-    needed = None
-    if views == "needed":
-        if isinstance(scene, SceneDescription):
-            raise InputError("the views that are needed follow from a scene file", field="views", got=views)
-        needed = kept_maps(scene, parameters, grid=grid, size=size, margin=MARGIN)
+    if keep != "all" and isinstance(scene, SceneDescription):
+        raise InputError("the maps that are needed follow from a scene file", field="keep", got=keep)
+    needed = kept_maps(keep, scene, parameters, grid=grid, size=size, margin=MARGIN)
     if not isinstance(scene, SceneDescription):
         scene = read_scene(scene, parameters, size=size)
 
@@ -124,10 +120,7 @@ def realtime(
             "triangles": sum(len(mesh.faces) for mesh in scene.meshes),
             "lights": len(scene.lights),
             "environment": scene.environment.name if scene.environment else None,
-            "resident_views": _count(needed, "views"),
-            "resident_lights": _count(needed, "lights"),
-            "resident_entries": _count(needed, "entries"),
-            "resident_levels": _count(needed, "levels"),
+            "kept": number_kept(needed),
             **renderer.environment_facts,
             **device.facts(renderer.ctx),
         }
@@ -137,16 +130,9 @@ def realtime(
     if needed and meta["not_finite"]:
         # Views that are not there give no number: such a picture is not handed out.
         raise BtfrefError(
-            f"{meta['not_finite']} channels needed maps that were not kept; render with all views"
+            f"{meta['not_finite']} channels needed maps that were not kept; render with all maps"
         )
     return RenderResult(image, None, meta)
-
-
-def _count(needed, kind):
-    """Directions kept by file, where they were chosen."""
-    if not needed:
-        return None
-    return {file: None if kept[kind] is None else len(kept[kind]) for file, kept in needed.items()}
 
 
 class Renderer:

@@ -17,6 +17,7 @@ from btfref.errors import InputError
 from btfref.rendering.result import RenderResult
 from btfref.scene.camera import film_rays
 from btfref.scene.description import read_scene
+from btfref.scene.lights import distant_or_delta
 from btfref.scene.loading import loaded
 
 #: Independent pictures that the result is the mean of.
@@ -201,22 +202,6 @@ def _single_material(scene, parameters=None, *, size=None):
     return description, first
 
 
-def _distant_or_delta(scene):
-    """The emitters of a Mitsuba scene; those that have an area at a finite distance are refused."""
-    import mitsuba as mi
-
-    known = mi.EmitterFlags.DeltaPosition, mi.EmitterFlags.DeltaDirection, mi.EmitterFlags.Infinite
-    for emitter in scene.emitters():
-        if not int(emitter.flags()) & sum(int(flag) for flag in known):
-            raise InputError(
-                "unsupported light",
-                field="emitter",
-                got=emitter.class_name(),
-                expected="point, directional, constant or envmap",
-            )
-    return scene.emitters()
-
-
 def _intersect(scene, material, offset, pixel, chosen):
     """Hits of one camera ray a pixel, as Dr.Jit arrays.
 
@@ -257,7 +242,7 @@ def _intersect(scene, material, offset, pixel, chosen):
         return turned if (cosine, sine) != (1.0, 0.0) else mi.Vector3f(w.x, w.y, w.z * side)
 
     lights = []
-    for emitter in _distant_or_delta(scene):
+    for emitter in distant_or_delta(scene):
         sample, power = emitter.sample_direction(si, chosen, si.is_valid())
         power = dr.select(si.is_valid() & (sample.pdf > 0), mi.Color3f(power), 0)
         lights.append((local(si.to_local(sample.d)), power))

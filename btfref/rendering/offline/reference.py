@@ -1,4 +1,4 @@
-"""The reference renderer: Mitsuba with any integrator, and noise-free direct light of delta lights."""
+"""The reference renderer: Mitsuba with any integrator, and direct light on a regular sub-pixel grid."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from btfref.errors import BtfrefError, InputError
 from btfref.rendering.result import RenderResult
 from btfref.sampling.variant import no_collection
 from btfref.scene.camera import film_rays, grid_offsets, tell_camera
+from btfref.scene.demand import MARGIN, kept_maps, number_kept
+from btfref.scene.lights import distant_or_delta, is_delta
 from btfref.scene.loading import loaded
 
 #: Independent renders whose spread gives the variance of the mean: 15 degrees of freedom.
@@ -23,12 +25,11 @@ def render(
     variant="llvm_ad_rgb",
     spp=None,
     seed=0,
-    noise_free=None,
+    grid=None,
     shadows=True,
     size=None,
     with_variance=False,
-    grid=None,
-    maps="all",
+    keep="all",
     debug=False,
 ):
     """Render a scene with Mitsuba.
@@ -45,27 +46,25 @@ def render(
         Samples per pixel in place of the scene's.
     seed : int
         The same seed gives the same image on the same machine.
-    noise_free : int, optional
-        Direct light only, n × n regular sub-pixel samples at (i + ½)/n, the material evaluated towards each
-        light: nothing is random. Needs delta lights and a JIT variant; replaces integrator, sampler, spp and
-        seed.
+    grid : int, optional
+        Direct light only, at n × n regular sub-pixel positions (i + ½)/n, in place of integrator and sampler. Where all
+        lights are points or directional, the material is evaluated towards each of them: nothing is random, and spp
+        and seed say nothing. Under an environment directions of the light are random, and there are a variance and
+        four independent ``pictures``. Needs a JIT variant.
     shadows : bool
         False leaves cast shadows out: direct light of delta lights and an environment, whatever the scene's integrator.
     size : (int, int), optional
         Width and height in place of the scene's.
     with_variance : bool
-        Estimate the variance of the mean from independent renders of ``spp / 16`` samples each.
-    grid : int, optional
-        Direct light only, at n × n regular sub-pixel positions as ``noise_free``, but with random directions of the
-        light, so that environments are possible; always with a variance and four independent
-        ``pictures``.
-    maps : {"all", "needed"}
+        Estimate the variance of the mean from independent renders of ``spp / 16`` samples each; with ``grid`` take
+        random lights even where none needs it.
+    keep : {"all", "needed"}
         "needed" loads the maps of those views, levels of detail and entries of codebooks alone that the cameras' first
-        hits need, and without noise those of the lights as well: the same picture bit by bit. ``meta["maps"]`` says how
+        hits need, and with ``grid`` those of the lights as well: the same picture bit by bit. ``meta["kept"]`` says how
         many, by file.
     debug : bool
         A channel that is no number is an error. ``meta["not_finite"]`` counts them in any case: lookups outside of what
-        a file or ``maps`` holds give none.
+        a file or ``keep`` holds give none.
 
     Returns
     -------
@@ -74,55 +73,40 @@ def render(
     Raises
     ------
     InputError
-        For scenes that Mitsuba cannot load, and lights that ``noise_free`` cannot handle.
+        For scenes that Mitsuba cannot load, and lights that ``grid`` cannot handle.
     BtfrefError
         When a pixel needed maps that were not loaded (light that was reflected twice can), or with ``debug`` is no
         number for another reason.
     MissingDependencyError
         Without a usable LLVM for an llvm variant.
     """
-    for name, value in (("spp", spp), ("noise_free", noise_free), ("grid", grid)):
+    for name, value in (("spp", spp), ("grid", grid)):
         if value is not None and value < 1:
             raise InputError("at least one sample is needed", field=name, got=value, expected="≥ 1")
-    if maps not in ("all", "needed"):
-        raise InputError("unknown choice of maps", field="maps", got=maps, expected="all or needed")
-    kept = {}
-    if maps == "needed":
-        from btfref.scene.demand import MARGIN, kept_maps
-
-        lit = noise_free is not None
-        kept = kept_maps(
-            scene, parameters, lights=lit, grid=noise_free or 4, size=size, margin=MARGIN if lit else None
-        )
+    # Without a grid rays are random: views are found with a wide margin, and light may come from anywhere.
+    margin = MARGIN if grid else None
+    kept = kept_maps(
+        keep, scene, parameters, lights=grid is not None, grid=grid or 4, size=size, margin=margin
+    )
     with loaded(scene, parameters, variant=variant, size=size, kept=kept) as made:
-        found = traced(
-            made,
-            spp=spp,
-            seed=seed,
-            noise_free=noise_free,
-            shadows=shadows,
-            with_variance=with_variance,
-            grid=grid,
-        )
+        found = traced(made, spp=spp, seed=seed, grid=grid, shadows=shadows, with_variance=with_variance)
     lost = found.meta["not_finite"]
     if lost and (debug or kept):
         cause = "needed maps that were not loaded; render with all maps" if kept else "are no numbers"
         raise BtfrefError(f"{lost} channels {cause}")
     if kept:
-        found.meta["maps"] = {
-            file: {k: len(v) for k, v in chosen.items() if v is not None} for file, chosen in kept.items()
-        }
+        found.meta["kept"] = number_kept(kept)
     return found
 
 
 @no_collection()
-def traced(made, *, spp=None, seed=0, noise_free=None, shadows=True, with_variance=False, grid=None):
+def traced(made, *, spp=None, seed=0, grid=None, shadows=True, with_variance=False):
     """A picture of a scene that is `loaded`; further ones cost no loading.
 
     Parameters
     ----------
     made : mitsuba.Scene
-    spp, seed, noise_free, shadows, with_variance, grid
+    spp, seed, grid, shadows, with_variance
         As of `render`.
 
     Returns
@@ -132,19 +116,19 @@ def traced(made, *, spp=None, seed=0, noise_free=None, shadows=True, with_varian
     import mitsuba as mi
 
     spp = spp or _sample_count(made)
-    tell_camera(made, 1 / (noise_free or grid or spp**0.5))
+    tell_camera(made, 1 / (grid or spp**0.5))
     start, pictures = time.perf_counter(), None
-    if noise_free is not None:
-        image, variance = _noise_free(made, noise_free, shadows), None
-        settings = {"noise_free": noise_free, "shadows": shadows, "integrator": "noise-free direct"}
-    elif grid is not None:
+    if grid is None:
+        image, variance, settings = _monte_carlo(made, spp, seed, with_variance, shadows)
+    elif _all_delta(made) and not with_variance:
+        image, variance = _noise_free(made, grid, shadows), None
+        settings = {"grid": grid, "shadows": shadows, "integrator": "noise-free direct"}
+    else:
         from btfref.rendering.offline.direct_light import regular
 
         pictures, variance, spp = regular(made, grid, spp, seed, shadows)
         image = pictures.mean(0)
         settings = {"grid": grid, "spp": spp, "seed": seed, "shadows": shadows, "integrator": "direct"}
-    else:
-        image, variance, settings = _monte_carlo(made, spp, seed, with_variance, shadows)
     facts = {
         "renderer": "mitsuba",
         "variant": mi.variant(),
@@ -197,22 +181,24 @@ def _sample_count(scene):
     return int(scene.sensors()[0].sampler().sample_count())
 
 
-def _noise_free(scene, n, shadows):
-    """Mean over the grid of Σ over lights of incident power × ``bsdf.eval``; float32 (H, W, 3)."""
+def _all_delta(scene):
+    """Whether a regular grid needs no random number.
+
+    Raises
+    ------
+    InputError
+        For lights or a variant that a regular grid does not have.
+    """
     import drjit as dr
     import mitsuba as mi
 
     if not dr.is_jit_v(mi.Float):
-        raise InputError("the noise-free mode needs a JIT variant", field="variant", got=mi.variant())
-    delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
-    for emitter in scene.emitters():
-        if not int(emitter.flags()) & int(delta):
-            raise InputError(
-                "the noise-free mode needs delta lights",
-                field="emitter",
-                got=emitter.class_name(),
-                expected="point, directional…",
-            )
+        raise InputError("a regular grid needs a JIT variant", field="variant", got=mi.variant())
+    return all(is_delta(emitter) for emitter in distant_or_delta(scene))
+
+
+def _noise_free(scene, n, shadows):
+    """Mean over the grid of Σ over lights of incident power × ``bsdf.eval``; float32 (H, W, 3)."""
     sensor = scene.sensors()[0]
     width, height = (int(k) for k in sensor.film().crop_size())
     total = np.zeros((3, width * height))

@@ -146,10 +146,10 @@ def test_pictures_are_equal_bit_by_bit(need, fits, one_light):
     need("gl")
     for key in ("raw", "lpca"):
         parameters = one_light | {"btf": str(fits.path(key))}
-        whole = render(PLANE, parameters=parameters, noise_free=2, size=SIZE)
-        some = render(PLANE, parameters=parameters, noise_free=2, size=SIZE, maps="needed")
+        whole = render(PLANE, parameters=parameters, grid=2, size=SIZE)
+        some = render(PLANE, parameters=parameters, grid=2, size=SIZE, keep="needed")
         np.testing.assert_array_equal(some.image, whole.image)
-        (kept,) = some.meta["maps"].values()
+        (kept,) = some.meta["kept"].values()
         assert kept["views"] < 40
         assert kept["lights"] <= 6
         assert some.meta["not_finite"] == 0
@@ -157,20 +157,17 @@ def test_pictures_are_equal_bit_by_bit(need, fits, one_light):
     for key, tiling in (("laplacian", "40"), ("gbrdf", "3"), ("rf_lobes", "3")):
         parameters = one_light | {"btf": str(fits.path(key)), "tiling": tiling}
         for pictures in (
-            [
-                render(PLANE, parameters=parameters, noise_free=2, size=SIZE, maps=m)
-                for m in ("all", "needed")
-            ],
-            [realtime(PLANE, parameters=parameters, grid=2, size=SIZE, views=m) for m in ("all", "needed")],
+            [render(PLANE, parameters=parameters, grid=2, size=SIZE, keep=m) for m in ("all", "needed")],
+            [realtime(PLANE, parameters=parameters, grid=2, size=SIZE, keep=m) for m in ("all", "needed")],
         ):
             np.testing.assert_array_equal(pictures[1].image, pictures[0].image)
         if key == "laplacian":
-            assert max(pictures[1].meta["resident_levels"].values()) < len(fits(key).meta["levels"])
-    fast = [
-        realtime(PLANE, parameters=one_light, grid=1, size=SIZE, views=views) for views in ("all", "needed")
-    ]
+            (kept,) = pictures[1].meta["kept"].values()
+            assert kept["levels"] < len(fits(key).meta["levels"])
+    fast = [realtime(PLANE, parameters=one_light, grid=1, size=SIZE, keep=keep) for keep in ("all", "needed")]
     np.testing.assert_array_equal(fast[0].image, fast[1].image)
-    assert max(fast[1].meta["resident_lights"].values()) <= 6
+    (kept,) = fast[1].meta["kept"].values()
+    assert kept["lights"] <= 6
 
 
 @pytest.fixture(scope="module")
@@ -201,14 +198,14 @@ def test_a_store_of_what_is_needed(need, tmp_path, one_light, settings, whole):
         save(made, paths[name])
     assert paths["part"].stat().st_size <= tolerance("demand.one_light.bytes") * paths["whole"].stat().st_size
     images = [
-        render(PLANE, parameters=one_light | {"btf": str(path)}, noise_free=2, size=SIZE).image
+        render(PLANE, parameters=one_light | {"btf": str(path)}, grid=2, size=SIZE).image
         for path in paths.values()
     ]
     np.testing.assert_array_equal(images[0], images[1])
     other = one_light | {"btf": str(paths["part"]), "lights": "directional3"}
-    assert render(PLANE, parameters=other, noise_free=1, size=SIZE).meta["not_finite"] > 100
+    assert render(PLANE, parameters=other, grid=1, size=SIZE).meta["not_finite"] > 100
     with pytest.raises(BtfrefError, match="no numbers"):
-        render(PLANE, parameters=other, noise_free=1, size=SIZE, debug=True)
+        render(PLANE, parameters=other, grid=1, size=SIZE, debug=True)
     with pytest.raises(InputError, match="not resident"):
         load(paths["part"]).evaluate([0.2, 0.3], spherical(1.2, 3.0), spherical(1.2, 3.0))
 
@@ -256,14 +253,14 @@ def test_pairs_of_a_sphere(need, tmp_path, settings, whole):
         save(made[name], path)
     parameters = [scene | {"btf": str(path)} for path in paths.values()]
     for pictures in (
-        [render(sphere, parameters=p, noise_free=2, size=SIZE) for p in parameters],
+        [render(sphere, parameters=p, grid=2, size=SIZE) for p in parameters],
         [realtime(sphere, parameters=p, grid=2, size=SIZE) for p in parameters],
     ):
         assert pictures[0].image.max() > 0
         np.testing.assert_array_equal(pictures[0].image, pictures[1].image)
     # Samples of another picture lie between those that were looked at: the margin covers them but for a few at the
     # silhouette, which are counted and never wrong.
-    for settings_of_samples in ({"noise_free": 5}, {"spp": 16, "seed": 5}):
+    for settings_of_samples in ({"grid": 5}, {"spp": 16, "seed": 5}):
         made = [render(sphere, parameters=p, size=SIZE, **settings_of_samples) for p in parameters]
         there = np.isfinite(made[0].image).all(-1)
         assert (~there).sum() <= tolerance("demand.sphere.missing_pixels")
@@ -272,7 +269,7 @@ def test_pairs_of_a_sphere(need, tmp_path, settings, whole):
     # Another light is another set of pairs; both together are filled in without a change of what is there.
     three = scene | {"lights": "directional3"}
     (more,) = demand(sphere, parameters=three, size=SIZE, grid=2, shape=(views, lights, texels)).values()
-    assert render(sphere, parameters=three | {"btf": str(paths["part"])}, noise_free=1, size=SIZE).meta[
+    assert render(sphere, parameters=three | {"btf": str(paths["part"])}, grid=1, size=SIZE).meta[
         "not_finite"
     ]
     store = synthesize_store(out, "checker", only=(one | more).part(), **settings)
@@ -365,5 +362,5 @@ def test_commands(need, tmp_path, capsys, fits):
     assert main(["fit", "raw", str(out), "--partial", "-o", str(made)]) == 0
     assert main(["fit", "lpca", str(out), "--partial", "-o", str(tmp_path / "no.lpca.exr")]) == 2
     assert "needs the whole BTF" in capsys.readouterr().err
-    words = ["render", "plane", "-o", str(tmp_path / "x.exr"), f"-Dbtf={made}", "--noise-free", "1"]
+    words = ["render", "plane", "-o", str(tmp_path / "x.exr"), f"-Dbtf={made}", "--grid", "1"]
     assert main([*words, "--size", "16x16", "--debug"]) == 0
