@@ -93,10 +93,14 @@ def reference_file():
 
 @pytest.fixture(scope="session")
 def fits(tmp_path_factory):
-    """Fits of every method to the oracle's tables, made on first use: see `oracle.Fits`."""
+    """Fits of every method to the oracle's tables, made on first use by one worker for all: see `oracle.Fits`."""
     from oracle import Fits
 
-    return Fits(tmp_path_factory.mktemp("fits"))
+    # Workers of one run have folders of their own beside each other.
+    root = tmp_path_factory.getbasetemp()
+    folder = (root.parent if "PYTEST_XDIST_WORKER" in os.environ else root) / "fits"
+    folder.mkdir(exist_ok=True)
+    return Fits(folder)
 
 
 @pytest.fixture

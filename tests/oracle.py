@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
+import pickle
+from pathlib import Path
+
 import numpy as np
 
 from btfref.numerics.sphere.directions import directions
@@ -40,16 +44,16 @@ SHAPE = (16, 12)
 
 
 class Fits:
-    """Every method fitted once to each kind of table, with its defaults; shared by all tests of a run.
+    """Every method fitted once to each kind of table, with its defaults; shared by all tests and workers of a run.
 
     Parameters
     ----------
     directory : Path
-        For the files.
+        For the files; the same for all workers of a run, which wait for each other's fits.
     """
 
     def __init__(self, directory):
-        self._directory, self._btfs, self._made, self._written = directory, {}, {}, set()
+        self._directory, self._btfs, self._made = Path(directory), {}, {}
 
     def btf(self, kind="ubo81"):
         """The table; see KINDS."""
@@ -60,13 +64,22 @@ class Fits:
     def __call__(self, key, kind="ubo81"):
         """The representation; not to be changed."""
         if (key, kind) not in self._made:
-            self._made[key, kind] = method(key).fit(self.btf(kind))
+            self._made[key, kind] = self._shared(key, kind)
         return self._made[key, kind]
 
     def path(self, key, kind="ubo81"):
         """The representation's file; not to be changed."""
-        path = self._directory / f"{kind}.{key}.exr"
-        if path not in self._written:
-            save(self(key, kind), path)
-            self._written.add(path)
-        return path
+        self(key, kind)
+        return self._directory / f"{kind}.{key}.exr"
+
+    def _shared(self, key, kind):
+        """The fit of whichever worker came first, as it was in that worker's memory."""
+        kept = self._directory / f"{kind}.{key}.pickle"
+        with open(self._directory / f"{kind}.{key}.lock", "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # released when the file is closed
+            if not kept.exists():
+                made = method(key).fit(self.btf(kind))
+                save(made, self._directory / f"{kind}.{key}.exr")
+                kept.write_bytes(pickle.dumps(made))
+                return made
+        return pickle.loads(kept.read_bytes())
