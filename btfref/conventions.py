@@ -20,6 +20,7 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.precision import real
 
@@ -84,7 +85,7 @@ class PixelClass(IntEnum):
         return self.name.lower()
 
 
-def luminance(rgb):
+def luminance(rgb: ArrayLike) -> np.ndarray:
     """Luminance of linear Rec. 709 colours, shape (..., 3) -> (...)."""
     return np.asarray(rgb) @ LUMINANCE
 
@@ -96,7 +97,7 @@ LEAST_Z = 2.0**-126
 SQUARED_LENGTHS = (0.25, 4.0)
 
 
-def valid_directions(w):
+def valid_directions(w: ArrayLike) -> np.ndarray:
     """Where a vector is a direction above the horizon: the one rule of all evaluators.
 
     Parameters
@@ -116,7 +117,7 @@ def valid_directions(w):
         return (w[..., 2] >= LEAST_Z) & (square > low) & (square < high)
 
 
-def malformed(uv, w_light, w_view):
+def malformed(uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike) -> dict[str, int]:
     """How many lookups ask for what is none: apart from directions below the horizon, which are ordinary.
 
     Parameters
@@ -132,7 +133,7 @@ def malformed(uv, w_light, w_view):
         `mitsuba_plugins.lib.lookup.malformed`, ``shaders/lib/lookup/malformed.glsl``.
     """
     low, high = SQUARED_LENGTHS
-    unit = True
+    unit = np.array(True)
     with np.errstate(invalid="ignore", over="ignore"):
         for w in (w_light, w_view):
             w = real(w)
@@ -142,7 +143,7 @@ def malformed(uv, w_light, w_view):
     return {"directions": int(np.count_nonzero(~unit)), "coordinates": int(np.count_nonzero(~finite))}
 
 
-def texel_stencil(uv, shape, filter_type):
+def texel_stencil(uv: ArrayLike, shape: Sequence[int], filter_type: str) -> tuple[np.ndarray, np.ndarray]:
     """Texels that a lookup at ``uv`` blends, and their weights.
 
     Parameters

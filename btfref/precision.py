@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
 import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
 
 _KIND = ContextVar("precision", default="float64")
 
 
-def precision():
+def precision() -> np.dtype:
     """Type of the numbers that definitions compute with: numpy.dtype of float64 or float32."""
     return np.dtype(_KIND.get())
 
 
-def real(values):
+def real(values: ArrayLike) -> np.ndarray:
     """``values`` as an array of numbers of :func:`precision`; no copy where they are that already."""
     return np.asarray(values, _KIND.get())
 
 
 @contextmanager
-def computing_in(kind):
+def computing_in(kind: DTypeLike) -> Iterator[None]:
     """Let definitions compute in another precision, in this thread and context alone.
 
     Parameters

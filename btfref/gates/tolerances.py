@@ -1,9 +1,9 @@
 """The limits of gates and tests, read from ``tolerances.toml``, where each has its reason.
 
-The file beside this module holds the gates that methods share; ``limits/`` holds a file per wing with what only the tests
-of that wing ask for. A method brings what concerns it alone in a ``tolerances.toml``
-beside its own module (`btfref.registry.Method.tolerances`): gates of its own, and ``[GATE.METHOD]`` with limits that it
-has instead of those of a shared gate (`tolerance_of`).
+The file beside this module holds the gates that methods share; ``limits/`` holds a file per wing with what only the
+tests of that wing ask for. A method brings what concerns it alone in a ``tolerances.toml`` beside its own module
+(`btfref.registry.Method.tolerances`): gates of its own, and ``[GATE.METHOD]`` with limits that it has instead of those
+of a shared gate (`tolerance_of`).
 """
 
 from __future__ import annotations

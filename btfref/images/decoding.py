@@ -6,12 +6,19 @@ import contextlib
 import io
 import struct
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from btfref.errors import InputError
 from btfref.images import radiance
+from btfref.types import PathLike
+
+if TYPE_CHECKING:
+    import PIL.Image
 
 #: Bytes of one decoded picture.
 LARGEST = 1 << 30
@@ -20,7 +27,7 @@ _EXR = b"\x76\x2f\x31\x01"
 _EXR_BYTES = {0: 4, 1: 2, 2: 4}
 
 
-def header(data, where):
+def header(data: bytes, where: PathLike) -> tuple[str, int, int, tuple[str, ...]]:
     """Kind, rows, columns and channel names of a picture, without decoding it.
 
     Parameters
@@ -61,7 +68,7 @@ def header(data, where):
     return kind, rows, columns, channels
 
 
-def decode(data, where, shape):
+def decode(data: bytes, where: PathLike, shape: tuple[int, int]) -> tuple[np.ndarray, tuple[str, ...]]:
     """Channels of a picture.
 
     Parameters
@@ -105,7 +112,7 @@ def decode(data, where, shape):
     return pixels, channels
 
 
-def _opened(data, where):
+def _opened(data: bytes, where: PathLike) -> PIL.Image.Image:
     from PIL import Image
 
     try:
@@ -118,13 +125,13 @@ def _opened(data, where):
     return image
 
 
-def _exr_header(data, where):
+def _exr_header(data: bytes, where: PathLike) -> tuple[int, int, tuple[str, ...], int]:
     """Rows, columns, channel names and bytes per pixel, from the attributes alone."""
 
-    def damaged(field, at, got):
+    def damaged(field: str, at: int, got: object) -> InputError:
         return InputError("damaged OpenEXR file", file=where, field=f"{field} at byte {at}", got=got)
 
-    def word(at):
+    def word(at: int) -> tuple[str, int]:
         end = data.find(b"\0", at, at + 256)
         if end < 0:
             raise damaged("attribute name", at, data[at : at + 16])
@@ -172,7 +179,7 @@ def _exr_header(data, where):
     return bottom - top + 1, right - left + 1, tuple(names), size
 
 
-def _exr(data, where, channels, shape):
+def _exr(data: bytes, where: PathLike, channels: tuple[str, ...], shape: tuple[int, int]) -> np.ndarray:
     import OpenEXR
 
     # The bindings read files by name only.
@@ -197,7 +204,7 @@ def _exr(data, where, channels, shape):
     return np.stack(planes, -1)
 
 
-def write_exr(planes, path, dtype=np.float16):
+def write_exr(planes: Mapping[str, np.ndarray], path: PathLike, dtype: DTypeLike = np.float16) -> None:
     """Write channels as half floats, or floats.
 
     Parameters

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.numerics.colour import encode_srgb
+from btfref.types import Facts
 
 
 @dataclass(frozen=True)
@@ -21,21 +23,21 @@ class Display:
 
     stops: float = 0.0
 
-    def linear(self, image):
+    def linear(self, image: ArrayLike) -> np.ndarray:
         """Displayed light in [0, 1] of linear radiance, same shape, float64; non-finite values become 0."""
         scaled = np.nan_to_num(np.asarray(image, np.float64), nan=0.0, posinf=0.0, neginf=0.0)
         return np.clip(scaled * 2.0**self.stops, 0.0, 1.0)
 
-    def encoded(self, image):
+    def encoded(self, image: ArrayLike) -> np.ndarray:
         """Values in [0, 1] encoded as sRGB, same shape, float64."""
         return encode_srgb(self.linear(image))
 
-    def to_dict(self):
+    def to_dict(self) -> Facts:
         """JSON-able description."""
         return {"stops": self.stops, "curve": "scale, clip to [0, 1], sRGB"}
 
 
-def fit_display(reference, mask=None):
+def fit_display(reference: ArrayLike, mask: np.ndarray | None = None) -> Display:
     """A display that shows a picture well: its 99th percentile, taken over lit pixels, comes to 0.9.
 
     Parameters

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.errors import InputError
 from btfref.images.display import Display
 from btfref.numerics.colour import decode_srgb
 from btfref.outputs import new_file
+from btfref.types import PathLike
 
 _MAGIC = {".exr": b"\x76\x2f\x31\x01", ".png": b"\x89PNG\r\n\x1a\n"}
 
 
-def load_image(path, *, finite=False):
+def load_image(path: PathLike, *, finite: bool = False) -> np.ndarray:
     """Read a picture as linear Rec. 709.
 
     Parameters
@@ -56,7 +60,13 @@ def load_image(path, *, finite=False):
     return image
 
 
-def save_image(path, image, *, display=None, attributes=None):
+def save_image(
+    path: PathLike,
+    image: ArrayLike,
+    *,
+    display: Display | None = None,
+    attributes: Mapping[str, str] | None = None,
+) -> None:
     """Write a picture; the file appears complete or not at all.
 
     Parameters
@@ -96,7 +106,7 @@ def save_image(path, image, *, display=None, attributes=None):
         raise InputError("unknown kind of picture", file=path, got=repr(path.suffix), expected=".exr or .png")
 
 
-def _load_exr(path):
+def _load_exr(path: Path) -> np.ndarray:
     import OpenEXR
 
     try:
@@ -121,7 +131,7 @@ def _load_exr(path):
     return _in_display_window(pixels.astype(np.float32), header)
 
 
-def _in_display_window(pixels, header):
+def _in_display_window(pixels: np.ndarray, header: Mapping[str, Any]) -> np.ndarray:
     """Pixels of the data window, cropped or filled with 0 to the display window."""
     (x0, y0), _ = (np.asarray(corner) for corner in header["dataWindow"])
     (left, top), (right, bottom) = (np.asarray(corner) for corner in header["displayWindow"])
@@ -138,7 +148,7 @@ def _in_display_window(pixels, header):
     return result
 
 
-def _load_png(path):
+def _load_png(path: Path) -> np.ndarray:
     from PIL import Image
 
     try:

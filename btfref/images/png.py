@@ -6,9 +6,10 @@ import struct
 import zlib
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 
-def encode_png(pixels):
+def encode_png(pixels: ArrayLike) -> bytes:
     """PNG of 8-bit pixels.
 
     Parameters

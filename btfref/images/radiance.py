@@ -8,8 +8,10 @@ from __future__ import annotations
 import re
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.errors import InputError
+from btfref.types import PathLike
 
 #: Longest header; a picture without its resolution line by then is none.
 _HEADER = 1 << 16
@@ -17,12 +19,12 @@ _HEADER = 1 << 16
 _RESOLUTION = re.compile(rb"([+-])([XY]) {1,4}(\d{1,6}) {1,4}([+-])([XY]) {1,4}(\d{1,6})")
 
 
-def is_radiance(data):
+def is_radiance(data: bytes) -> bool:
     """Whether bytes start as a Radiance picture does."""
     return data.startswith((b"#?RADIANCE", b"#?RGBE"))
 
 
-def size(data, where):
+def size(data: bytes, where: PathLike) -> tuple[int, int, int, bool, bool]:
     """Rows, columns, offset of the pixels, and whether rows run upwards and columns to the left.
 
     Notes
@@ -60,7 +62,7 @@ def size(data, where):
     return rows, columns, stop + 1, upwards, leftwards
 
 
-def decode(data, where):
+def decode(data: bytes, where: PathLike) -> np.ndarray:
     """Linear colours of a Radiance picture, float32, shape (rows, columns, 3), row 0 at the top.
 
     Raises
@@ -83,7 +85,7 @@ def decode(data, where):
     return np.ascontiguousarray(values[:, ::-1] if leftwards else values, np.float32)
 
 
-def _flat(data, at, rows, columns, where):
+def _flat(data: bytes, at: int, rows: int, columns: int, where: PathLike) -> np.ndarray:
     need = rows * columns * 4
     if len(data) - at < need:
         raise InputError(
@@ -92,10 +94,10 @@ def _flat(data, at, rows, columns, where):
     return np.frombuffer(data, np.uint8, need, at).reshape(rows, columns, 4)
 
 
-def _line(data, at, columns, out, row, where):
+def _line(data: bytes, at: int, columns: int, out: np.ndarray, row: int, where: PathLike) -> int:
     """Unpack one scan line; returns the offset behind it."""
 
-    def damaged(what):
+    def damaged(what: str) -> InputError:
         return InputError("damaged picture", file=where, field=f"row {row} at byte {at}", got=what)
 
     if (
@@ -127,7 +129,7 @@ def _line(data, at, columns, out, row, where):
     return at
 
 
-def encode(image, *, reversed_line=False):
+def encode(image: ArrayLike, *, reversed_line: bool = False) -> bytes:
     """Bytes of a Radiance picture, without runs, as older programs read it.
 
     Parameters

@@ -6,14 +6,15 @@ from functools import cache
 from importlib import resources
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 
-def _rgb_to_xyz():
+def _rgb_to_xyz() -> np.ndarray:
     """Matrix from the chromaticities of the primaries and of D65 (ITU-R BT.709-6, item 1.3 and 1.4)."""
     xy = np.array([[0.64, 0.33], [0.30, 0.60], [0.15, 0.06]])
     white = np.array([0.3127, 0.3290])
 
-    def lift(chromaticity):
+    def lift(chromaticity: np.ndarray) -> np.ndarray:
         x, y = chromaticity[..., 0], chromaticity[..., 1]
         return np.stack([x / y, np.ones_like(x), (1 - x - y) / y], axis=-1)
 
@@ -34,24 +35,24 @@ _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0
 _D50 = np.array([0.9642, 1.0, 0.8249])
 
 
-def encode_srgb(linear):
+def encode_srgb(linear: ArrayLike) -> np.ndarray:
     """The sRGB encoding of linear values in [0, 1] (IEC 61966-2-1), float64, same shape."""
     x = np.asarray(linear, np.float64)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
-def decode_srgb(encoded):
+def decode_srgb(encoded: ArrayLike) -> np.ndarray:
     """Linear values of sRGB-encoded values in [0, 1] (IEC 61966-2-1), float64, same shape."""
     x = np.asarray(encoded, np.float64)
     return np.where(x <= 0.04045, x / 12.92, ((np.maximum(x, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
-def rgb_from_xyz(xyz):
+def rgb_from_xyz(xyz: ArrayLike) -> np.ndarray:
     """Linear Rec. 709 of CIE XYZ under D65, white at Y = 1; same shape (..., 3). Nothing is clipped."""
     return np.asarray(xyz) @ XYZ_TO_RGB.T.astype(np.result_type(xyz, np.float32))
 
 
-def rgb_from_lab_d50(lab):
+def rgb_from_lab_d50(lab: ArrayLike) -> np.ndarray:
     """Linear Rec. 709 of CIE L*a*b* under D50, the profile connection space; same shape (..., 3).
 
     CIE 15:2004, 8.2.1.1 inverted, then Bradford's adaptation from D50 to D65. Nothing is clipped.
@@ -67,14 +68,14 @@ def rgb_from_lab_d50(lab):
 
 
 @cache
-def _observer():
+def _observer() -> tuple[np.ndarray, np.ndarray]:
     """Wavelengths in nm and x̄, ȳ, z̄, each times the power of D65: CIE 018:2019 (2°, 1931) and CIE 15:2004."""
     text = resources.files("btfref.numerics").joinpath("cie1931_d65.csv").read_text("utf-8")
     table = np.array([line.split(",") for line in text.splitlines() if line[:1].isdigit()], float)
     return table[:, 0], table[:, 1:4] * table[:, 4:5]
 
 
-def spectral_weights(wavelengths):
+def spectral_weights(wavelengths: ArrayLike) -> np.ndarray:
     """Weights that turn reflectance at some wavelengths into linear Rec. 709 under D65.
 
     Parameters

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import numpy as np
+from numpy.typing import ArrayLike
+
+from btfref.types import JitArray
 
 #: What Dr.Jit aligns its own arrays to, bytes.
 ALIGNMENT = 64
 
 
-def to_device(kind, array):
+def to_device(kind: type[Any], array: ArrayLike) -> JitArray:
     """A Dr.Jit array with a copy of a NumPy array.
 
     Dr.Jit's LLVM backend takes the memory of a NumPy array as it is, and compiles kernels anew for memory
@@ -40,7 +46,7 @@ def to_device(kind, array):
     return kind(aligned)
 
 
-def in_one_kernel(width, scatters):
+def in_one_kernel(width: int, scatters: Callable[[], object]) -> None:
     """Run several scatters to the same array as one kernel.
 
     Dr.Jit evaluates an array with a pending scatter before the next one to it, and each of these kernels
@@ -56,7 +62,7 @@ def in_one_kernel(width, scatters):
     import drjit as dr
     import mitsuba as mi
 
-    def step(k):
+    def step(k: JitArray) -> tuple[JitArray]:
         scatters()
         return (k + 1,)
 
@@ -64,7 +70,7 @@ def in_one_kernel(width, scatters):
     dr.while_loop((dr.zeros(mi.UInt32, width),), lambda k: k < once, step)
 
 
-def packed(values):
+def packed(values: Sequence[JitArray]) -> JitArray:
     """Numbers of each lane side by side, so that one lookup of four costs about what one number costs alone.
 
     Parameters
@@ -85,7 +91,7 @@ def packed(values):
     dr.eval(values)
     lane = dr.arange(mi.UInt32, width)
 
-    def write():
+    def write() -> None:
         for k, value in enumerate(values):
             dr.scatter(result, value, lane * count + k)
 
@@ -94,7 +100,7 @@ def packed(values):
     return result
 
 
-def unpacked(table, index, count, active=True):
+def unpacked(table: JitArray, index: JitArray, count: int, active: JitArray = True) -> list[JitArray]:
     """The numbers of some lanes of `packed`: a list of ``count``."""
     import drjit as dr
     import mitsuba as mi

@@ -14,6 +14,7 @@ level would blur five times as much as the pixel, in variance.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 #: How a renderer chooses λ. "distance" is log2 of the distance (Ma et al. 2005, section 3.4).
 MODES = ("auto", "distance", "none")
@@ -28,7 +29,9 @@ BLUR = 5.0
 TINY = 1e-30
 
 
-def cone_footprint(gradient_u, gradient_v, w_view, normal, width):
+def cone_footprint(
+    gradient_u: ArrayLike, gradient_v: ArrayLike, w_view: ArrayLike, normal: ArrayLike, width: ArrayLike
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Footprint of a pixel on a plane.
 
     Parameters
@@ -58,7 +61,9 @@ def cone_footprint(gradient_u, gradient_v, w_view, normal, width):
     return ellipse_footprint(square * uu, square * uv, square * vv)
 
 
-def ellipse_footprint(uu, uv, vv):
+def ellipse_footprint(
+    uu: ArrayLike, uv: ArrayLike, vv: ArrayLike
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Level of detail and lookups for an elliptic footprint.
 
     Parameters
@@ -86,6 +91,6 @@ def ellipse_footprint(uu, uv, vv):
     return 0.5 * np.log2(1 + square / BLUR), np.sqrt(square)[..., None] * axis, ratio
 
 
-def probe_weight(j, ratio):
+def probe_weight(j: float, ratio: np.ndarray) -> np.ndarray:
     """Weight of the lookup ``j`` steps from the middle; the weights of all whole j sum to 1, continuously in ratio."""
     return np.clip(0.5 * ratio + 0.5 - abs(j), 0, 1) / ratio

@@ -46,7 +46,7 @@ class Hit:
     local: np.ndarray
     height: np.ndarray
 
-    def __getitem__(self, index):
+    def __getitem__(self, index: np.ndarray | slice) -> Hit:
         """Some of the points."""
         return Hit(self.cell[index], self.local[index], self.height[index])
 
@@ -64,37 +64,37 @@ class HeightField:
     heights: np.ndarray
 
     @property
-    def shape(self):
+    def shape(self) -> tuple[int, int]:
         """Rows and columns."""
         return self.heights.shape
 
     @cached_property
-    def top(self):
+    def top(self) -> float:
         """Largest height."""
         return float(self.heights.max())
 
     @cached_property
-    def bottom(self):
+    def bottom(self) -> float:
         """Smallest height."""
         return float(self.heights.min())
 
     @property
-    def depth(self):
+    def depth(self) -> float:
         """Distance from the bottom to the top."""
         return self.top - self.bottom
 
     @property
-    def tangent_limit(self):
+    def tangent_limit(self) -> float:
         """Largest tangent of a ray: with it, no ray travels further than :data:`MAXIMUM_TRAVEL`."""
         return MAXIMUM_TRAVEL / max(self.depth, abs(self.top), abs(self.bottom), 1e-6)
 
     @property
-    def maximum_steps(self):
+    def maximum_steps(self) -> int:
         """Most cells that a ray can cross."""
         return int(2 * MAXIMUM_TRAVEL * max(self.shape)) + 4
 
     @cached_property
-    def cells(self):
+    def cells(self) -> np.ndarray:
         """Corner heights of the patches, float32 (rows, columns, 4).
 
         In the order (row, column), (row, column + 1), (row + 1, column), (row + 1, column + 1).
@@ -104,7 +104,7 @@ class HeightField:
         return np.stack([h, right, np.roll(h, -1, 0), np.roll(right, -1, 0)], -1)
 
     @cached_property
-    def slopes(self):
+    def slopes(self) -> np.ndarray:
         """Derivatives along u and v at the texel centres by the Sobel filter, float32 (rows, columns, 2)."""
         h = np.asarray(self.heights, float)
         rows, columns = h.shape
@@ -115,13 +115,13 @@ class HeightField:
             result.append(smooth * (n / 8))
         return np.stack(result, -1).astype(np.float32)
 
-    def tangents(self, w):
+    def tangents(self, w: np.ndarray) -> np.ndarray:
         """``w_xy / w_z``, held at :attr:`tangent_limit`; shape (N, 3) -> (N, 2)."""
         w = real(w)
         across = np.hypot(w[:, 0], w[:, 1])
         return w[:, :2] / np.maximum(w[:, 2], across / self.tangent_limit)[:, None]
 
-    def view_hits(self, uv, w):
+    def view_hits(self, uv: np.ndarray, w: np.ndarray) -> Hit:
         """First points of the surface on rays from above.
 
         Parameters
@@ -148,7 +148,7 @@ class HeightField:
         )
         return self._hit(cell.astype(np.int64), start, travel, np.minimum(s, 1), crossed)
 
-    def points(self, uv):
+    def points(self, uv: np.ndarray) -> Hit:
         """Points of the surface above positions of the tile, shape (N, 2) -> Hit."""
         position = real(uv) * real([self.shape[1], self.shape[0]]) - 0.5
         cell = np.floor(position)
@@ -157,7 +157,7 @@ class HeightField:
             cell.astype(np.int64), position - cell, zero, np.zeros(len(position), zero.dtype), zero
         )
 
-    def lit(self, hit, w):
+    def lit(self, hit: Hit, w: np.ndarray) -> np.ndarray:
         """Whether points see a direction.
 
         Parameters
@@ -184,21 +184,33 @@ class HeightField:
             result[rest] = s > 1
         return result
 
-    def _hit(self, cell, start, travel, s, crossed):
+    def _hit(
+        self, cell: np.ndarray, start: np.ndarray, travel: np.ndarray, s: np.ndarray, crossed: np.ndarray
+    ) -> Hit:
         size = np.array([self.shape[1], self.shape[0]])
         cell = (cell + crossed.astype(np.int64)) % size
         local = np.clip(start - crossed + s[:, None] * travel, 0, 1)
         height, _, _, _ = self._patch(cell[:, 0], cell[:, 1], local[:, 0], local[:, 1])
         return Hit(cell, local, height)
 
-    def _patch(self, column, row, a, b):
+    def _patch(
+        self, column: np.ndarray, row: np.ndarray, a: np.ndarray, b: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Height at (a, b) of a patch, and its coefficients of a, b and ab."""
         h00, h10, h01, h11 = np.moveaxis(real(self.cells[row, column]), -1, 0)
         hx, hy = h10 - h00, h01 - h00
         hxy = (h11 - h10) - hy
         return h00 + hx * a + (hy + hxy * a) * b, hx, hy, hxy
 
-    def _march(self, cell, start, travel, z0, dz, lift=None):
+    def _march(
+        self,
+        cell: np.ndarray,
+        start: np.ndarray,
+        travel: np.ndarray,
+        z0: np.ndarray,
+        dz: np.ndarray,
+        lift: float | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Parameter of the first hit, infinite where there is none up to 1, and the cells crossed before it.
 
         Parameters
@@ -251,7 +263,7 @@ class HeightField:
         return hit, crossed_at_hit
 
 
-def first_root(f0, f1, f2):
+def first_root(f0: np.ndarray, f1: np.ndarray, f2: np.ndarray) -> np.ndarray:
     """Smallest q ≥ 0 with ``f0 + f1 q + f2 q² ≤ 0``, infinite where there is none; without cancellation."""
     disc = f1 * f1 - 4 * f2 * f0
     root = np.sqrt(np.maximum(disc, 0))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.numerics.sphere.parabolic import (
     bilinear_stencil,
@@ -27,7 +28,7 @@ _N_THETA, _N_PHI = 28, 24
 _MARGIN = 1.05
 
 
-def geometry_factor(cos_light, cos_view):
+def geometry_factor(cos_light: ArrayLike, cos_view: ArrayLike) -> np.ndarray:
     """``k1·n / (k1·n + k2·n − (k1·n)(k2·n))`` in [0, 1]: light's cosine over the denominator of the BRDF.
 
     Parameters
@@ -48,19 +49,19 @@ def geometry_factor(cos_light, cos_view):
     return np.where(light > 0, light / np.where(light > 0, denominator, 1), 0.0)
 
 
-def schlick(u, r0):
+def schlick(u: np.ndarray, r0: np.ndarray | float) -> np.ndarray:
     """Schlick's Fresnel term ``r0 + (1 − r0)(1 − u)^5`` of the cosine u in [0, 1]."""
     return r0 + (1 - r0) * fifth_power(u)
 
 
-def fifth_power(u):
+def fifth_power(u: ArrayLike) -> np.ndarray:
     """``(1 − u)^5`` for u held in [0, 1]."""
     v = 1 - np.clip(u, 0, 1)
     square = v * v
     return square * square * v
 
 
-def specular_albedo_bound(ndf, r0):
+def specular_albedo_bound(ndf: ArrayLike, r0: ArrayLike) -> np.ndarray:
     """Upper bound, over all views, of the albedo of ``p(h) F(k1·h) k1·n / D``.
 
     Parameters
@@ -85,7 +86,7 @@ def specular_albedo_bound(ndf, r0):
 
 
 @lru_cache(maxsize=8)
-def _albedo_operators(n):
+def _albedo_operators(n: int) -> np.ndarray:
     """Albedo of each view for a unit value in each texel of an n × n table, two of shape (views, n²).
 
     For F = 1, and for F = (1 − u)^5.
@@ -111,7 +112,7 @@ def _albedo_operators(n):
     return result
 
 
-def isotropic_ndf(roughness, n=32):
+def isotropic_ndf(roughness: float, n: int = 32) -> np.ndarray:
     """Table of an isotropic GGX distribution times cos θ, whose integral is 1, shape (n, n).
 
     Parameters

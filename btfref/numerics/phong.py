@@ -6,10 +6,12 @@ Source: Ma et al. 2005, eq. 5: ``μ'(l, v) = k_a + k_d (n · l) + k_s (n · h)^�
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.numerics.powers import safe_power
-from btfref.numerics.solvers.levenberg import backend, fit_batch
+from btfref.numerics.solvers.levenberg import Samples, backend, fit_batch
 from btfref.precision import real
+from btfref.types import JitArray
 
 #: Exponents that the fits start from: one lane each, the best wins.
 STARTS = (1.0, 4.0, 16.0, 64.0, 256.0)
@@ -21,7 +23,7 @@ EXPONENTS = (0.25, 512.0)
 BOUND = 100.0
 
 
-def phong(parameters, w_light, w_view):
+def phong(parameters: ArrayLike, w_light: np.ndarray, w_view: np.ndarray) -> np.ndarray:
     """The model.
 
     Parameters
@@ -35,18 +37,18 @@ def phong(parameters, w_light, w_view):
     -------
     ndarray of float64, shape (...)
     """
-    ambient, diffuse, specular, exponent = (float(p) for p in parameters)
+    ambient, diffuse, specular, exponent = (float(p) for p in np.asarray(parameters))
     cosine = half_cosine(w_light, w_view)
     return ambient + diffuse * w_light[..., 2] + specular * safe_power(cosine, exponent)
 
 
-def half_cosine(w_light, w_view):
+def half_cosine(w_light: ArrayLike, w_view: ArrayLike) -> np.ndarray:
     """Cosine between the normal and the half vector, n · h, of unit vectors, shape (..., 3), (..., 3) -> (...)."""
     half = real(w_light) + real(w_view)
     return half[..., 2] / np.sqrt((half**2).sum(-1))
 
 
-def fit_phong(table, views, lights):
+def fit_phong(table: ArrayLike, views: np.ndarray, lights: np.ndarray) -> tuple[np.ndarray, float]:
     """The best Phong model of a table.
 
     Parameters
@@ -72,11 +74,11 @@ def fit_phong(table, views, lights):
     cosine = module.Float(np.ascontiguousarray(w_light[..., 2], np.float32).ravel())
     half = module.Float(half_cosine(w_light, w_view).astype(np.float32).ravel())
 
-    def model(p, _):
+    def model(p: list[JitArray], _: JitArray) -> tuple[Samples, list[JitArray]]:
         ambient, diffuse, specular, log_exponent = p
         exponent = dr.exp(log_exponent)
 
-        def samples(step):
+        def samples(step: JitArray) -> list[tuple[JitArray, list[JitArray]]]:
             light = dr.gather(module.Float, cosine, step)
             log = dr.log(dr.maximum(dr.gather(module.Float, half, step), 1e-6))
             power = dr.exp(exponent * log)
@@ -98,7 +100,7 @@ def fit_phong(table, views, lights):
     return best, float(np.sqrt((misfit**2).mean()))
 
 
-def _linear_start(table, w_light, w_view, exponent):
+def _linear_start(table: np.ndarray, w_light: np.ndarray, w_view: np.ndarray, exponent: float) -> list[float]:
     """Coefficients that are best for a given exponent, and its logarithm."""
     columns = [np.ones(table.size), w_light[..., 2].ravel(), half_cosine(w_light, w_view).ravel() ** exponent]
     coefficients, *_ = np.linalg.lstsq(np.stack(columns, 1), table.ravel(), rcond=1e-6)

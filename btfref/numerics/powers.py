@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.precision import real
 
@@ -25,7 +26,7 @@ LIMIT_LOG2 = 15.0
 LOWEST_LOG2 = -126.0
 
 
-def safe_power(base, exponent):
+def safe_power(base: ArrayLike, exponent: ArrayLike) -> np.ndarray:
     """``base`` to the power ``exponent``, saturated; computed in the type of the arguments.
 
     Parameters
@@ -46,7 +47,7 @@ def safe_power(base, exponent):
     return _from_log(np.log2(np.where(counts, base, 1)), exponent, counts, kind)
 
 
-def lobe_power(t, light, n):
+def lobe_power(t: ArrayLike, light: ArrayLike, n: ArrayLike) -> np.ndarray:
     """``(t · l)^n`` of a lobe as the paper stores it, ``t`` of any length; eq. 1.
 
     The axis is scaled by its largest component first, so that neither the product nor the power can overflow.
@@ -75,7 +76,7 @@ def lobe_power(t, light, n):
     return _from_log(log, n, counts, kind)
 
 
-def unit_lobe(axis, light, n):
+def unit_lobe(axis: ArrayLike, light: ArrayLike, n: ArrayLike) -> np.ndarray:
     """``(axis · l)^n`` of unit vectors, from the square of their distance.
 
     Near the axis ``axis · l = 1 − |axis − l|² / 2`` keeps the digits that the product loses and a large exponent
@@ -99,7 +100,7 @@ def unit_lobe(axis, light, n):
     return _from_log(log, real(n), counts, log.dtype)
 
 
-def _from_log(log, exponent, counts, kind):
+def _from_log(log: np.ndarray, exponent: np.ndarray, counts: np.ndarray, kind: np.dtype) -> np.ndarray:
     # An infinite product is as good as any other beyond the limits.
     with np.errstate(over="ignore"):
         product = np.asarray(log * exponent, kind)

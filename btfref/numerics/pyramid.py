@@ -10,7 +10,10 @@ Texel centres are at (i + ½)/n at every level, so that levels do not shift agai
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.conventions import FILTER_TYPES
 from btfref.errors import InputError
@@ -24,7 +27,7 @@ REDUCTIONS = ("binomial", "box")
 _BALANCING = 200
 
 
-def level_shapes(shape, n_levels=None):
+def level_shapes(shape: Sequence[int], n_levels: int | None = None) -> list[tuple[int, int]]:
     """Rows and columns of each level: halves, rounded up.
 
     Parameters
@@ -45,7 +48,8 @@ def level_shapes(shape, n_levels=None):
     """
     shapes = [(int(shape[0]), int(shape[1]))]
     while shapes[-1] != (1, 1):
-        shapes.append(tuple((n + 1) // 2 for n in shapes[-1]))
+        rows, columns = shapes[-1]
+        shapes.append(((rows + 1) // 2, (columns + 1) // 2))
     if n_levels is None:
         return shapes
     if not 1 <= n_levels <= len(shapes):
@@ -55,7 +59,7 @@ def level_shapes(shape, n_levels=None):
     return shapes[:n_levels]
 
 
-def expansion(n, m, filter_type):
+def expansion(n: int, m: int, filter_type: str) -> np.ndarray:
     """Values at the centres of ``n`` texels from those of ``m``, along one axis.
 
     Parameters
@@ -89,7 +93,7 @@ def expansion(n, m, filter_type):
     return result
 
 
-def reduction(n, m, kind):
+def reduction(n: int, m: int, kind: str) -> np.ndarray:
     """Values of ``m`` texels from those of ``n``, one level below, along one axis.
 
     Parameters
@@ -131,7 +135,7 @@ def reduction(n, m, kind):
     return result
 
 
-def apply(rows, columns, image):
+def apply(rows: np.ndarray, columns: np.ndarray, image: np.ndarray) -> np.ndarray:
     """A separable operator on images, shape (r, c, ...) -> (r', c', ...), in the images' own type."""
     rows, columns = rows.astype(image.dtype), columns.astype(image.dtype)
     # One operator at a time as a matrix product; the trailing axes stay contiguous.
@@ -140,13 +144,13 @@ def apply(rows, columns, image):
     return np.matmul(columns, flat).reshape(len(rows), len(columns), *image.shape[2:])
 
 
-def reduce_image(image, kind):
+def reduce_image(image: np.ndarray, kind: str) -> np.ndarray:
     """The next coarser level of images, shape (r, c, ...) -> (⌈r/2⌉, ⌈c/2⌉, ...)."""
     r, c = image.shape[:2]
     return apply(reduction(r, (r + 1) // 2, kind), reduction(c, (c + 1) // 2, kind), image)
 
 
-def expand_image(image, shape, filter_type):
+def expand_image(image: np.ndarray, shape: Sequence[int], filter_type: str) -> np.ndarray:
     """Images looked up at the texel centres of a finer level, shape (r, c, ...) -> (*shape, ...)."""
     r, c = image.shape[:2]
     if (r, c) == tuple(shape):
@@ -154,7 +158,7 @@ def expand_image(image, shape, filter_type):
     return apply(expansion(shape[0], r, filter_type), expansion(shape[1], c, filter_type), image)
 
 
-def gaussian_pyramid(image, n_levels, kind):
+def gaussian_pyramid(image: np.ndarray, n_levels: int, kind: str) -> list[np.ndarray]:
     """Ever coarser levels of images, the images first; a list of ``n_levels`` arrays."""
     level_shapes(image.shape[:2], n_levels)
     levels = [image]
@@ -163,7 +167,7 @@ def gaussian_pyramid(image, n_levels, kind):
     return levels
 
 
-def laplacian_pyramid(image, n_levels, kind, filter_type):
+def laplacian_pyramid(image: np.ndarray, n_levels: int, kind: str, filter_type: str) -> list[np.ndarray]:
     """Differences of each level to the sum of the coarser ones, and the coarsest level itself.
 
     Ma et al. 2005, eq. 2 and 3, but for the expansion; see above.
@@ -187,12 +191,12 @@ def laplacian_pyramid(image, n_levels, kind, filter_type):
     return levels
 
 
-def reconstruct(levels, k, filter_type):
+def reconstruct(levels: Sequence[np.ndarray], k: int, filter_type: str) -> np.ndarray:
     """Level k of the images from a Laplacian pyramid: the sum of levels k and coarser."""
-    return sum(expand_image(level, levels[k].shape[:2], filter_type) for level in levels[k:])
+    return np.asarray(sum(expand_image(level, levels[k].shape[:2], filter_type) for level in levels[k:]))
 
 
-def level_weights(lod, n_levels):
+def level_weights(lod: ArrayLike, n_levels: int) -> np.ndarray:
     """Weights of the levels at a level of detail, ``w_k = clamp(1 − λ + k, 0, 1)`` (Ma et al. 2005, eq. 7).
 
     Parameters
@@ -211,7 +215,7 @@ def level_weights(lod, n_levels):
     return np.clip(1 - lod + k, 0, 1)
 
 
-def clamped_lod(lod, n_levels):
+def clamped_lod(lod: ArrayLike, n_levels: int) -> np.ndarray:
     """λ within [0, n_levels − 1]; NaN counts as 0."""
     lod = real(lod)
     return np.clip(np.where(np.isnan(lod), 0.0, lod), 0, n_levels - 1)

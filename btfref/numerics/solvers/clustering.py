@@ -12,7 +12,7 @@ MAXIMUM_ITERATIONS = 60
 LLOYD_ITERATIONS = 8
 
 
-def spread_seeds(points, n_clusters, rng):
+def spread_seeds(points: np.ndarray, n_clusters: int, rng: np.random.Generator) -> np.ndarray:
     """Indices of initial centres by k-means++ (Arthur and Vassilvitskii 2007)."""
     chosen = [int(rng.integers(len(points)))]
     squared = (points**2).sum(1)
@@ -27,16 +27,18 @@ def spread_seeds(points, n_clusters, rng):
     return np.array(chosen)
 
 
-def _distance(points, squared, i):
+def _distance(points: np.ndarray, squared: np.ndarray, i: int) -> np.ndarray:
     return np.maximum(squared - 2 * points @ points[i] + squared[i], 0)
 
 
-def assign_nearest(points, centres):
+def assign_nearest(points: np.ndarray, centres: np.ndarray) -> np.ndarray:
     """Index of the nearest centre of each point; ties go to the lowest index."""
     return np.argmin((centres**2).sum(1) - 2 * points @ centres.T, 1)
 
 
-def lloyd(points, n_clusters, rng, *, iterations=LLOYD_ITERATIONS):
+def lloyd(
+    points: np.ndarray, n_clusters: int, rng: np.random.Generator, *, iterations: int = LLOYD_ITERATIONS
+) -> tuple[np.ndarray, np.ndarray]:
     """A few iterations of k-means from k-means++ seeds.
 
     Parameters
@@ -63,7 +65,9 @@ def lloyd(points, n_clusters, rng, *, iterations=LLOYD_ITERATIONS):
     return assign_nearest(points, centres), centres
 
 
-def local_pca(points, n_clusters, n_components, rng):
+def local_pca(
+    points: np.ndarray, n_clusters: int, n_components: int, rng: np.random.Generator
+) -> tuple[np.ndarray, int]:
     """Partition points such that each cluster's affine subspace reconstructs its members best.
 
     Alternates assignment to the cluster whose mean and leading components leave the smallest squared error with the
@@ -85,7 +89,9 @@ def local_pca(points, n_clusters, n_components, rng):
         return _local_pca(points, n_clusters, n_components, rng)
 
 
-def _local_pca(points, n_clusters, n_components, rng):
+def _local_pca(
+    points: np.ndarray, n_clusters: int, n_components: int, rng: np.random.Generator
+) -> tuple[np.ndarray, int]:
     n, dimension = points.shape
     n_used = min(n_clusters, n)
     rank = min(n_components, dimension)
@@ -109,7 +115,7 @@ def _local_pca(points, n_clusters, n_components, rng):
     return best, iteration
 
 
-def leading_axes(points, rank):
+def leading_axes(points: np.ndarray, rank: int) -> np.ndarray:
     """Leading principal directions about the mean, shape (n, r) -> (min(rank, r), r); zero rows without variance."""
     centred = points - points.mean(0)
     value, vector = np.linalg.eigh(centred.T @ centred)
@@ -118,7 +124,7 @@ def leading_axes(points, rank):
     return (axes * (value[::-1][: axes.shape[1]] > 1e-12 * max(value[-1], 1e-300))).T
 
 
-def reconstruction_errors(points, labels, n_clusters, rank):
+def reconstruction_errors(points: np.ndarray, labels: np.ndarray, n_clusters: int, rank: int) -> np.ndarray:
     """Squared error of every point in every cluster's affine subspace, shape (n, n_clusters)."""
     n = len(points)
     squared = (points**2).sum(1)

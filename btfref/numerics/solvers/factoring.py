@@ -7,9 +7,12 @@ as the values of a BTF have their texels: tables are (view, light, m), factors (
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.numerics.sphere.halfway import half_difference
 from btfref.numerics.sphere.parabolic import bilinear_stencil
@@ -28,16 +31,21 @@ WEIGHT_FLOOR = 0.1
 TERM_SWEEPS = 20
 
 
-def sparse_operator(index, weight, n):
+def sparse_operator(index: ArrayLike, weight: ArrayLike, n: int) -> Any:
     """Sparse matrix of a stencil, float32 (rows, n): row i blends the samples ``index[i]`` with ``weight[i]``."""
     from scipy import sparse
 
-    index = np.asarray(index).reshape(len(index), -1)
+    index = np.asarray(index)
+    index = index.reshape(len(index), -1)
     rows = np.repeat(np.arange(len(index)), index.shape[1])
     entries = (np.asarray(weight).reshape(-1).astype(np.float32), (rows, index.reshape(-1)))
     matrix = sparse.csr_matrix(entries, shape=(len(index), n))
     matrix.eliminate_zeros()
     return matrix
+
+
+#: Factors by name: "p", "q", "r" and perhaps "d", shape (term, sample, m).
+Factors = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -50,39 +58,39 @@ class FactorOperators:
     q, d : sparse matrices, shapes (views * lights, n_q) and (…, n_d); d is None without a difference factor
     """
 
-    p: object
-    q: object
-    r: object
-    d: object = None
+    p: Any
+    q: Any
+    r: Any
+    d: Any = None
 
     @property
-    def shape(self):
+    def shape(self) -> tuple[int, int]:
         """Number of views and lights."""
         return self.r.shape[0], self.p.shape[0]
 
-    def read(self, name, factor):
+    def read(self, name: str, factor: np.ndarray) -> np.ndarray:
         """Values of a factor's terms where it is measured: (term, n, m) -> (term, rows, m)."""
         operator = getattr(self, name)
         return np.stack([operator @ term for term in factor])
 
-    def in_out(self, factors):
+    def in_out(self, factors: Factors) -> np.ndarray:
         """``Σ_k P_k(l) R_k(v)``, shape (view, light, m)."""
         p, r = self.read("p", factors["p"]), self.read("r", factors["r"])
         return np.einsum("kvm,klm->vlm", r, p)
 
-    def half(self, factors):
+    def half(self, factors: Factors) -> np.ndarray:
         """``Σ_j Q_j(h) D_j(d)``, shape (view, light, m)."""
         q = self.read("q", factors["q"])
         if self.d is not None:
             q = q * self.read("d", factors["d"])
         return q.sum(0).reshape(*self.shape, -1)
 
-    def product(self, factors):
+    def product(self, factors: Factors) -> np.ndarray:
         """The approximation of the tables, shape (view, light, m)."""
         return self.in_out(factors) * self.half(factors)
 
 
-def rank_terms(data, weight, terms):
+def rank_terms(data: np.ndarray, weight: np.ndarray | None, terms: int) -> tuple[np.ndarray, np.ndarray]:
     """Non-negative ``Σ_k left_k right_k`` that approximates ``data`` in the least-squares sense.
 
     For one term this is the first singular pair, which is non-negative for non-negative data (Perron and Frobenius),
@@ -105,13 +113,13 @@ def rank_terms(data, weight, terms):
     left, right = np.zeros((terms, a, m), data.dtype), np.zeros((terms, b, m), data.dtype)
     known = np.ones((a, b), data.dtype) if weight is None else weight
 
-    def rest(k):
+    def rest(k: int) -> np.ndarray:
         others = [j for j in range(terms) if j != k and left[j].any()]
         if not others:
             return data
         return data - known[..., None] * np.einsum("kam,kbm->abm", left[others], right[others])
 
-    def improve(k, residual):
+    def improve(k: int, residual: np.ndarray) -> None:
         left[k] = np.maximum(np.einsum("abm,bm->am", residual, right[k]), 0) / np.maximum(
             known @ right[k] ** 2, TINY
         )
@@ -130,7 +138,7 @@ def rank_terms(data, weight, terms):
     return left, right
 
 
-def sample_weights(data, exponent):
+def sample_weights(data: np.ndarray, exponent: float) -> np.ndarray:
     """Weights of samples' squared errors, ``(data + WEIGHT_FLOOR)^−exponent``.
 
     Parameters
@@ -143,7 +151,13 @@ def sample_weights(data, exponent):
     return (data + np.float32(WEIGHT_FLOOR)) ** np.float32(-exponent)
 
 
-def refine(data, factors, operators, sweeps, weight=1):
+def refine(
+    data: np.ndarray,
+    factors: Factors,
+    operators: FactorOperators,
+    sweeps: int,
+    weight: np.ndarray | float = 1,
+) -> dict[str, np.ndarray]:
     """Sweeps of multiplicative updates towards the least weighted squared error of the product itself.
 
     Lee and Seung 2001, with the other factors and the reading of the maps as known linear operators: each update keeps
@@ -164,7 +178,7 @@ def refine(data, factors, operators, sweeps, weight=1):
     """
     factors = dict(factors)
 
-    def update(name, numerator, denominator):
+    def update(name: str, numerator: Iterable[np.ndarray], denominator: Iterable[np.ndarray]) -> None:
         operator = getattr(operators, name).T
         factors[name] = factors[name] * np.stack(
             [
@@ -196,7 +210,7 @@ def refine(data, factors, operators, sweeps, weight=1):
     return factors
 
 
-def map_operators(views, lights, n, with_difference):
+def map_operators(views: np.ndarray, lights: np.ndarray, n: int, with_difference: bool) -> FactorOperators:
     """How n × n parabolic maps are read at all pairs of directions.
 
     Parameters

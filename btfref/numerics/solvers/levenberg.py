@@ -12,9 +12,14 @@ writes it out and takes the next one that nobody has.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import ModuleType
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from btfref.types import Facts, JitArray
 
 #: Ways in which a fit ends; 0 is the only one that is no convergence.
 STATUS = {
@@ -30,6 +35,12 @@ LAUNCH = 1 << 17
 
 #: Lanes of a launch; each takes the next fit when its own has ended.
 RUNNING_LANES = 1 << 10
+
+#: ``samples(step)``: residuals r of one or several samples and their [u_0, …], see :func:`fit_batch`.
+Samples = Callable[[JitArray], list[tuple[JitArray, list[JitArray]]]]
+
+#: ``(p, fit) -> (samples, units)``, see :func:`fit_batch`.
+Model = Callable[[list[JitArray], JitArray], tuple[Samples, list[JitArray]]]
 
 _FIRST_DAMPING = 1e-1
 _TINY = 1e-30
@@ -60,12 +71,12 @@ class BatchFit:
     iterations: np.ndarray
 
     @property
-    def converged(self):
+    def converged(self) -> np.ndarray:
         """Whether each fit converged, shape (N,)."""
         return self.status > 0
 
     @property
-    def summary(self):
+    def summary(self) -> Facts:
         """JSON-able counts: fits, converged ones, ends by kind, mean iterations."""
         count = np.bincount(self.status, minlength=len(STATUS))
         return {
@@ -77,7 +88,7 @@ class BatchFit:
         }
 
 
-def backend():
+def backend() -> ModuleType:
     """Dr.Jit's array module: CUDA where there is a device, else LLVM.
 
     Raises
@@ -98,18 +109,18 @@ def backend():
 
 
 def fit_batch(
-    model,
-    start,
-    lower,
-    upper,
-    n_steps,
+    model: Model,
+    start: ArrayLike,
+    lower: ArrayLike,
+    upper: ArrayLike,
+    n_steps: int,
     *,
-    iterations=100,
-    gtol=1e-4,
-    ftol=1e-6,
-    xtol=1e-5,
-    progress=None,
-):
+    iterations: int = 100,
+    gtol: float = 1e-4,
+    ftol: float = 1e-6,
+    xtol: float = 1e-5,
+    progress: Callable[[int, int], object] | None = None,
+) -> BatchFit:
     """Minimise ``½ Σ_s r_s(p, fit)²`` over p within bounds, for each of N fits on its own.
 
     Parameters
@@ -140,12 +151,12 @@ def fit_batch(
     -------
     BatchFit
     """
-    start = np.atleast_2d(np.asarray(start, np.float32))
-    n = len(start)
-    lower, upper = (np.broadcast_to(np.asarray(b, np.float32), start.shape) for b in (lower, upper))
-    start = np.clip(start, lower, upper)
-    solver = _Solver(model, start, lower, upper, n_steps, iterations, (gtol, ftol, xtol))
-    parameters, cost = np.zeros_like(start), np.zeros(n, np.float32)
+    first_guess = np.atleast_2d(np.asarray(start, np.float32))
+    n = len(first_guess)
+    low, high = (np.broadcast_to(np.asarray(b, np.float32), first_guess.shape) for b in (lower, upper))
+    first_guess = np.clip(first_guess, low, high)
+    solver = _Solver(model, first_guess, low, high, n_steps, iterations, (gtol, ftol, xtol))
+    parameters, cost = np.zeros_like(first_guess), np.zeros(n, np.float32)
     status, count = np.zeros(n, np.uint8), np.zeros(n, np.uint16)
     for first in range(0, n, LAUNCH):
         part = slice(first, min(first + LAUNCH, n))
@@ -162,7 +173,16 @@ class _Solver:
     registers, and no lane waits for the slowest of a batch.
     """
 
-    def __init__(self, model, start, lower, upper, n_steps, iterations, tolerances):
+    def __init__(
+        self,
+        model: Model,
+        start: np.ndarray,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        n_steps: int,
+        iterations: int,
+        tolerances: tuple[float, float, float],
+    ) -> None:
         self.module = backend()
         import drjit as dr
 
@@ -175,7 +195,7 @@ class _Solver:
             self.module.Float(np.ascontiguousarray(a, np.float32).ravel()) for a in (start, lower, upper)
         )
 
-    def run(self, first, last):
+    def run(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Fit ``first`` to ``last − 1``: parameters, cost, status and iterations as NumPy arrays."""
         import drjit as dr
 
@@ -188,12 +208,22 @@ class _Solver:
         fit = begin + dr.arange(UInt32, lanes)
         dr.eval(out, taken, fit)
         # Python scalars and literals would be compiled into the kernel as constants of the first iteration.
-        many = lambda n: [dr.zeros(Float, lanes) for _ in range(n)]  # noqa: E731
-        state = (fit, dr.zeros(UInt32, lanes), many(width), many(1)[0], many(width))
-        state += (many(width * (width + 1) // 2), many(1)[0], many(1)[0])
+        one = lambda: dr.zeros(Float, lanes)  # noqa: E731
+        many = lambda n: [one() for _ in range(n)]  # noqa: E731
+        hessian = many(width * (width + 1) // 2)
+        state = (fit, dr.zeros(UInt32, lanes), many(width), one(), many(width), hessian, one(), one())
         dr.make_opaque(state)
 
-        def body(fit, count, p, cost, gradient, hessian, damping, growth):
+        def body(
+            fit: JitArray,
+            count: JitArray,
+            p: list[JitArray],
+            cost: JitArray,
+            gradient: list[JitArray],
+            hessian: list[JitArray],
+            damping: JitArray,
+            growth: JitArray,
+        ) -> tuple[JitArray, ...]:
             p, cost, gradient, hessian, damping, growth, status = self._step(
                 fit, count == 0, p, cost, gradient, hessian, damping, growth
             )
@@ -213,7 +243,9 @@ class _Solver:
         parameters, cost, status, count = (np.array(a) for a in out)
         return parameters.reshape(size, width), cost, status, count
 
-    def _normal_equations(self, p, fit):
+    def _normal_equations(
+        self, p: list[JitArray], fit: JitArray
+    ) -> tuple[JitArray, list[JitArray], list[JitArray]]:
         """Cost, gradient Jᵀr, and the upper triangle of JᵀJ row by row, by one pass over the samples."""
         import drjit as dr
 
@@ -224,7 +256,9 @@ class _Solver:
         # Copies: an in-place operation of the model must not reach the state.
         samples, units = self.model([Float(x) for x in p], fit)
 
-        def body(step, cost, gradient, hessian):
+        def body(
+            step: JitArray, cost: JitArray, gradient: list[JitArray], hessian: list[JitArray]
+        ) -> tuple[JitArray, JitArray, list[JitArray], list[JitArray]]:
             for r, row in samples(step):
                 cost = dr.fma(r, r, cost)
                 gradient = [dr.fma(row[i], r, gradient[i]) for i in range(width)]
@@ -241,7 +275,17 @@ class _Solver:
         hessian = [h * (units[i] * units[j]) for (i, j), h in zip(pairs, hessian, strict=True)]
         return 0.5 * cost, gradient, hessian
 
-    def _step(self, fit, fresh, p, cost, gradient, hessian, damping, growth):
+    def _step(
+        self,
+        fit: JitArray,
+        fresh: JitArray,
+        p: list[JitArray],
+        cost: JitArray,
+        gradient: list[JitArray],
+        hessian: list[JitArray],
+        damping: JitArray,
+        growth: JitArray,
+    ) -> tuple[list[JitArray], JitArray, list[JitArray], list[JitArray], JitArray, JitArray, JitArray]:
         """One trial step, or the start of a fresh fit; returns the state and how the fit ended, 0 if it did not."""
         import drjit as dr
 
@@ -252,9 +296,10 @@ class _Solver:
         frozen = [
             ((p[i] <= low[i]) & (gradient[i] >= 0)) | ((p[i] >= high[i]) & (gradient[i] <= 0)) for i in width
         ]
-        at = {}
-        for k, (i, j) in enumerate(zip(*np.triu_indices(self.width), strict=True)):
-            at[i, j] = at[j, i] = hessian[k]
+        at: dict[tuple[int, int], JitArray] = {}
+        pairs = [(i, j) for i in width for j in width[i:]]
+        for (i, j), value in zip(pairs, hessian, strict=True):
+            at[i, j] = at[j, i] = value
         # Scaled to unit columns: float32 then suffices for the factorisation.
         scale = [dr.select(at[i, i] > _TINY, dr.rsqrt(dr.maximum(at[i, i], _TINY)), 0) for i in width]
         dead = [frozen[i] | (at[i, i] <= _TINY) for i in width]
@@ -298,7 +343,7 @@ class _Solver:
         )
 
 
-def sum_max(dr, values):
+def sum_max(dr: ModuleType, values: Sequence[JitArray]) -> JitArray:
     """The largest of a list of Dr.Jit floats, lane by lane."""
     result = values[0]
     for value in values[1:]:
@@ -306,10 +351,19 @@ def sum_max(dr, values):
     return result
 
 
-def _damped_solution(dr, at, scale, dead, cosine, damping):
+def _damped_solution(
+    dr: ModuleType,
+    at: Mapping[tuple[int, int], JitArray],
+    scale: list[JitArray],
+    dead: list[JitArray],
+    cosine: list[JitArray],
+    damping: JitArray,
+) -> list[JitArray]:
     """Step of ``(C + λ I) y = −c`` with C the scaled matrix, by Cholesky; 0 for parameters that are held."""
     n = len(scale)
-    factor, inverse, y = {}, [], []
+    factor: dict[tuple[int, int], JitArray] = {}
+    inverse: list[JitArray] = []
+    y: list[JitArray] = []
     for i in range(n):
         for j in range(i):
             value = dr.select(dead[i] | dead[j], 0, at[i, j] * scale[i] * scale[j])
@@ -333,7 +387,7 @@ def _damped_solution(dr, at, scale, dead, cosine, damping):
     return [dr.select(dead[i], 0, y[i] * scale[i]) for i in range(n)]
 
 
-def _towards(dr, p, step, low, high):
+def _towards(dr: ModuleType, p: JitArray, step: JitArray, low: JitArray, high: JitArray) -> JitArray:
     """``p + step``, at most 90 % of the way to a bound, or on it from nearby.
 
     A step that overshoots and lands on a bound at once may switch a part of the model off for good: a lobe of height

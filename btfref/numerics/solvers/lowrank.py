@@ -8,7 +8,7 @@ from btfref.errors import InputError
 from btfref.numerics.solvers.threads import one_blas_thread
 
 
-def texel_matrix(values):
+def texel_matrix(values: np.ndarray) -> np.ndarray:
     """Matrix of a sampled BTF with one texel per row.
 
     Parameters
@@ -38,7 +38,9 @@ def texel_matrix(values):
     return result
 
 
-def range_basis(matrix, rank, rng, *, iterations=1):
+def range_basis(
+    matrix: np.ndarray, rank: int, rng: np.random.Generator, *, iterations: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
     """Orthonormal rows that span the dominant row space of ``matrix``, by randomized subspace iteration.
 
     Halko, Martinsson, Tropp (SIAM Review 2011), algorithm 4.4 on the transpose.
@@ -69,7 +71,7 @@ def range_basis(matrix, rank, rng, *, iterations=1):
     return _rotated(matrix, _orthonormal(sample.T), rank)
 
 
-def refined_basis(matrix, basis):
+def refined_basis(matrix: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A basis near the dominant row space, after one step of subspace iteration.
 
     Parameters
@@ -92,7 +94,7 @@ def refined_basis(matrix, basis):
     return basis * keep[:, None], coordinates * keep
 
 
-def _rotated(matrix, columns, rank):
+def _rotated(matrix: np.ndarray, columns: np.ndarray, rank: int) -> tuple[np.ndarray, np.ndarray]:
     """The leading principal directions within the span of orthonormal columns, and the coordinates along them."""
     projected = matrix @ columns
     with one_blas_thread():
@@ -102,7 +104,7 @@ def _rotated(matrix, columns, rank):
     return vectors.T @ columns.T, projected @ vectors
 
 
-def _orthonormal(columns):
+def _orthonormal(columns: np.ndarray) -> np.ndarray:
     """Orthonormal columns that span the same space."""
     with one_blas_thread():
         return np.linalg.qr(columns)[0]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 
-def one_blas_thread():
+
+def one_blas_thread() -> AbstractContextManager[object]:
     """Context in which BLAS and LAPACK use one thread.
 
     For long sequences of small products and factorizations: their threads would spend more time waiting for each

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,10 +13,11 @@ from numpy.typing import ArrayLike
 from btfref.errors import InputError
 from btfref.numerics.sphere import interpolation
 from btfref.numerics.sphere.quadrature import hemisphere_weights
+from btfref.types import PathLike
 
 #: Rings of the named sets: polar angle (degrees), number of samples, azimuth of the first sample (degrees).
 #: "ubo81": UBO2003, ATRIUM and UTIA; "ubo151": UBO2014, Dome 1.
-NAMED_RINGS = {
+NAMED_RINGS: dict[str, tuple[tuple[float, int, float], ...]] = {
     "ubo81": ((0, 1, 0), (15, 6, 0), (30, 12, 0), (45, 18, 0), (60, 20, 0), (75, 24, 0)),
     "ubo151": (
         (0, 1, 0),
@@ -56,13 +58,11 @@ class DirectionSet:
         """A set by its name ("ubo81", "10x5", …) or of vectors: see :func:`directions`."""
         return directions(spec)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.vectors)
 
-    def __eq__(self, other):
+    def __eq__(self, other: object) -> bool:
         return isinstance(other, DirectionSet) and np.array_equal(self.vectors, other.vectors)
-
-    __hash__ = None
 
     def __repr__(self) -> str:
         return f"<DirectionSet {self.name}: {len(self)} directions>"
@@ -73,52 +73,52 @@ class DirectionSet:
         return {"name": self.name, "count": len(self)}
 
     @property
-    def theta(self):
+    def theta(self) -> np.ndarray:
         """Polar angles in radians, shape (n,)."""
         x, y, z = self.vectors.T
         return np.arctan2(np.hypot(x, y), z)
 
     @property
-    def phi(self):
+    def phi(self) -> np.ndarray:
         """Azimuths in radians in [0, 2π), shape (n,)."""
         return np.mod(np.arctan2(self.vectors[:, 1], self.vectors[:, 0]), 2 * np.pi)
 
     @cached_property
-    def rings(self):
+    def rings(self) -> np.ndarray | None:
         """Rings as (n_rings, 4) (see :class:`~btfref.numerics.sphere.interpolation.RingInterpolation`), or None."""
         return _find_rings(self.theta, self.phi)
 
     @cached_property
-    def interpolation(self):
+    def interpolation(self) -> interpolation.RingInterpolation | interpolation.TriangleInterpolation:
         """The interpolation over this set: on rings where it has them, else on triangles."""
         if self.rings is not None:
             return interpolation.RingInterpolation(self.rings)
         return interpolation.triangulate(self.vectors)
 
-    def stencil(self, w, *, hold=True):
+    def stencil(self, w: ArrayLike, *, hold: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Neighbouring samples and weights of ``w``; see :meth:`RingInterpolation.stencil`."""
         return self.interpolation.stencil(w, hold=hold)
 
     @cached_property
-    def quadrature_weights(self):
+    def quadrature_weights(self) -> np.ndarray:
         """Solid-angle weights over the hemisphere in sr, shape (n,), positive, sum 2π."""
         return hemisphere_weights(self.vectors, self.interpolation.stencil)
 
 
-def ring_directions(rings):
+def ring_directions(rings: Sequence[tuple[float, int, float]]) -> np.ndarray:
     """Unit vectors of ``(polar angle, count, first azimuth)`` rings in degrees, shape (n, 3)."""
     theta = np.concatenate([np.full(count, angle, float) for angle, count, _ in rings])
     phi = np.concatenate([first + np.arange(count) * (360 / count) for _, count, first in rings])
     return spherical(np.radians(theta), np.radians(phi))
 
 
-def spherical(theta, phi):
+def spherical(theta: ArrayLike, phi: ArrayLike) -> np.ndarray:
     """Unit vectors of polar angle and azimuth in radians, shape (...) -> (..., 3)."""
     theta, phi = np.broadcast_arrays(theta, phi)
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
 
 
-def directions(spec):
+def directions(spec: str | DirectionSet | ArrayLike) -> DirectionSet:
     """A set of directions from its name, or from vectors.
 
     Parameters
@@ -154,7 +154,7 @@ def directions(spec):
     return checked(np.asarray(spec, float), "custom")
 
 
-def checked(vectors, name, *, file=None):
+def checked(vectors: np.ndarray, name: str, *, file: PathLike | None = None) -> DirectionSet:
     """A :class:`DirectionSet` of ``vectors`` after the checks that :func:`directions` documents."""
     if vectors.ndim != 2 or vectors.shape[1] != 3 or len(vectors) == 0:
         raise InputError(
@@ -188,7 +188,7 @@ def checked(vectors, name, *, file=None):
     return result
 
 
-def _find_rings(theta, phi):
+def _find_rings(theta: np.ndarray, phi: np.ndarray) -> np.ndarray | None:
     """Ring table of a set with a pole sample and rings of equal steps in index order, or None."""
     if theta[0] > RING_TOLERANCE:
         return None

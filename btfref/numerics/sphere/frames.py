@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.precision import real
 
@@ -11,7 +12,7 @@ from btfref.precision import real
 ROTATION_FLOOR = 0.01
 
 
-def shading_frame(normal, dp_du):
+def shading_frame(normal: ArrayLike, dp_du: ArrayLike) -> np.ndarray:
     """Orthonormal frame from a shading normal and the tangent ∂p/∂u.
 
     Parameters
@@ -33,7 +34,7 @@ def shading_frame(normal, dp_du):
     return np.stack([s, np.cross(normal, s), normal], -2)
 
 
-def nearest_rotation(linear):
+def nearest_rotation(linear: ArrayLike) -> tuple[float, float]:
     """The rotation nearest to a linear map of texture coordinates (its polar factor).
 
     By this angle local directions turn about the normal to reach the frame of a transformed texture.
@@ -54,7 +55,7 @@ def nearest_rotation(linear):
     return (cosine / length, sine / length) if length > 0 else (1.0, 0.0)
 
 
-def surface_frame(surface):
+def surface_frame(surface: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Tangent frame of slopes and of a rotation.
 
     Parameters

@@ -9,11 +9,12 @@ smooth on the whole hemisphere, so that float32 and float64 agree.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.precision import real
 
 
-def half_frame(h):
+def half_frame(h: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Tangent and bitangent at the half vector, shape (..., 3) -> two of (..., 3).
 
     Parameters
@@ -33,7 +34,7 @@ def half_frame(h):
 SHORT, LENGTHEN = 1e-15, 1e20
 
 
-def half_vector(w_light, w_view):
+def half_vector(w_light: ArrayLike, w_view: ArrayLike) -> np.ndarray:
     """Unit half vector, shape (..., 3); the normal where opposite directions on the horizon have none.
 
     Parameters
@@ -48,7 +49,7 @@ def half_vector(w_light, w_view):
     return np.where(length > 0, h / np.where(length > 0, length, 1), real([0.0, 0.0, 1.0]))
 
 
-def half_difference(w_light, w_view):
+def half_difference(w_light: ArrayLike, w_view: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Half and difference vectors.
 
     Parameters
@@ -68,7 +69,7 @@ def half_difference(w_light, w_view):
     return h, d
 
 
-def in_out(h, d):
+def in_out(h: ArrayLike, d: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Inverse of :func:`half_difference`: light and view directions, which may lie below the horizon.
 
     Parameters

@@ -12,21 +12,23 @@ Spherical Harmonics (SH) Tricks", GDC 2008.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.errors import InputError
 
 #: Windows by name; each takes l/n in [0, 1).
-WINDOWS = {
+WINDOWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "none": np.ones_like,
     "hanning": lambda x: 0.5 * (1 + np.cos(np.pi * x)),
     "lanczos": np.sinc,
 }
 
 
-def checked_order(order):
+def checked_order(order: object) -> int:
     """``order`` as an int of at least 1.
 
     Raises
@@ -38,12 +40,12 @@ def checked_order(order):
     return int(order)
 
 
-def bands(order):
+def bands(order: int) -> np.ndarray:
     """Band l of every coefficient, shape (order²,)."""
     return np.repeat(np.arange(order), 2 * np.arange(order) + 1)
 
 
-def values(w, order):
+def values(w: ArrayLike, order: int) -> np.ndarray:
     """The harmonics at directions.
 
     Parameters
@@ -81,7 +83,7 @@ def values(w, order):
     return result
 
 
-def project(samples, w, weights, order):
+def project(samples: ArrayLike, w: ArrayLike, weights: ArrayLike, order: int) -> np.ndarray:
     """Coefficients of a function that is known at the nodes of a quadrature.
 
     Parameters
@@ -103,7 +105,7 @@ def project(samples, w, weights, order):
     return np.tensordot(weighted, samples, (0, 0))
 
 
-def sphere_rule(order):
+def sphere_rule(order: int) -> tuple[np.ndarray, np.ndarray]:
     """Quadrature of the sphere that is exact for products of two harmonics of ``order``.
 
     Returns
@@ -122,7 +124,7 @@ def sphere_rule(order):
 
 
 @cache
-def quarter_turn(order):
+def quarter_turn(order: int) -> np.ndarray:
     """What a quarter turn about x makes of the harmonics: ``y_j(Rx(90°) w) = Σ_i X_ij y_i(w)``; (order², order²)."""
     w, weight = sphere_rule(order)
     x, y, z = w.T
@@ -138,7 +140,7 @@ def quarter_turn(order):
     return matrix
 
 
-def euler(to_world):
+def euler(to_world: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cosines and sines of (α, β, γ) with ``R = Rz(α) Ry(β) Rz(γ)``, and whether R mirrors.
 
     Parameters
@@ -159,17 +161,18 @@ def euler(to_world):
     b = _unit(r[..., 2, 2], np.hypot(r[..., 0, 2], r[..., 1, 2]))
     # The y row of Rz(−α) R is that of Ry(β) Rz(γ), which has no β: as good at the poles as elsewhere.
     c = _unit(a[0] * r[..., 1, 1] - a[1] * r[..., 0, 1], a[0] * r[..., 1, 0] - a[1] * r[..., 0, 0])
-    return *(np.stack([a[k], b[k], c[k]], -1) for k in range(2)), mirrored
+    cosine, sine = (np.stack([a[k], b[k], c[k]], -1) for k in range(2))
+    return cosine, sine, mirrored
 
 
-def _unit(cosine, sine):
+def _unit(cosine: np.ndarray, sine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     length = np.hypot(cosine, sine)
     there = length > 0
     safe = np.where(there, length, 1)
     return np.where(there, cosine / safe, 1.0), np.where(there, sine / safe, 0.0)
 
 
-def _about_z(coefficients, cosine, sine, order):
+def _about_z(coefficients: np.ndarray, cosine: np.ndarray, sine: np.ndarray, order: int) -> np.ndarray:
     """Coefficients of L(Rz(α) w) from those of L; (..., order², k) with (...) angles."""
     result = coefficients.copy()
     c, s = np.ones_like(cosine), np.zeros_like(sine)
@@ -184,14 +187,14 @@ def _about_z(coefficients, cosine, sine, order):
     return result
 
 
-def mirror_signs(order):
+def mirror_signs(order: int) -> np.ndarray:
     """Sign of every harmonic under z → −z: (−1)^(l + m), shape (order²,)."""
     band = bands(order)
     m = np.arange(order * order) - band * (band + 1)
     return np.where((band + m) % 2 == 0, 1.0, -1.0)
 
 
-def rotate(coefficients, to_world, order):
+def rotate(coefficients: ArrayLike, to_world: ArrayLike, order: int) -> np.ndarray:
     """Coefficients of ``w ↦ L(R w)`` from those of L.
 
     Parameters
@@ -222,12 +225,12 @@ def rotate(coefficients, to_world, order):
     return a[..., 0] if single else a
 
 
-def rotation_matrix(to_world, order):
+def rotation_matrix(to_world: ArrayLike, order: int) -> np.ndarray:
     """Matrix of :func:`rotate`, shape (..., order², order²): block diagonal, orthogonal."""
     return rotate(np.eye(checked_order(order) ** 2), to_world, order)
 
 
-def window(name, order):
+def window(name: str | None, order: int) -> np.ndarray:
     """Factor of every coefficient.
 
     Parameters
@@ -250,7 +253,7 @@ def window(name, order):
     return WINDOWS[name](bands(checked_order(order)) / order)
 
 
-def ringing(coefficients, order):
+def ringing(coefficients: ArrayLike, order: int) -> float:
     """Depth of the negative lobes of a function that should have none, relative to its largest value.
 
     Parameters

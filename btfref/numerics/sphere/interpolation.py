@@ -9,9 +9,11 @@ interpolation from those same arrays, so that the float64 definition sees exactl
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.errors import InputError
 from btfref.numerics.sphere.parabolic import hemisphere_to_square
@@ -39,7 +41,7 @@ class RingInterpolation:
 
     size = 4
 
-    def stencil(self, w, *, hold=True):
+    def stencil(self, w: ArrayLike, *, hold: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Neighbouring samples of the directions ``w`` and their weights.
 
         Parameters
@@ -65,7 +67,7 @@ class RingInterpolation:
         high = np.minimum(low + 1, last)
         step = table[high, 0] - table[low, 0]
         t = np.clip((theta - table[low, 0]) / np.where(step > 0, step, 1), 0, 1)
-        index, weight = [], []
+        indices, weights = [], []
         for ring, share in ((low, 1 - t), (high, t)):
             count = table[ring, 2]
             position = (turn - table[ring, 1] / (2 * np.pi)) * count
@@ -73,17 +75,17 @@ class RingInterpolation:
             first = np.minimum(np.floor(position), count - 1)
             fraction = position - first
             following = np.where(first + 1 < count, first + 1, 0)
-            index += [table[ring, 3] + first, table[ring, 3] + following]
-            weight += [share * (1 - fraction), share * fraction]
-        weight = np.stack(weight, -1)
+            indices += [table[ring, 3] + first, table[ring, 3] + following]
+            weights += [share * (1 - fraction), share * fraction]
+        weight = np.stack(weights, -1)
         if not hold:
             edge = table[last, 0]
             if np.cos(edge) > 1e-6:
                 fade = np.where(theta > edge, np.maximum(z, 0) / np.cos(edge), 1)
                 weight = weight * fade[..., None]
-        return np.stack(index, -1).astype(np.int64), weight
+        return np.stack(indices, -1).astype(np.int64), weight
 
-    def arrays(self, prefix):
+    def arrays(self, prefix: str) -> dict[str, np.ndarray]:
         """The tables of the ports: ``{prefix}_rings``, float32 (n_rings, 4)."""
         return {f"{prefix}_rings": np.asarray(self.rings, np.float32)}
 
@@ -109,7 +111,7 @@ class TriangleInterpolation:
 
     size = 3
 
-    def locate(self, w):
+    def locate(self, w: ArrayLike) -> np.ndarray:
         """Triangle that holds each direction, by walking from the start cell; shape (..., 3) -> (...)."""
         w = real(w)
         table = real(self.triangles)
@@ -128,7 +130,7 @@ class TriangleInterpolation:
             current = np.where(outside, across, current)
         return current
 
-    def stencil(self, w, *, hold=True):
+    def stencil(self, w: ArrayLike, *, hold: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Neighbouring samples and weights, as :meth:`RingInterpolation.stencil`, with three samples."""
         w = real(w)
         row = real(self.triangles)[self.locate(w)]
@@ -144,7 +146,7 @@ class TriangleInterpolation:
             weight = weight * np.where(beyond, np.minimum(fade, 1), 1)[..., None]
         return np.maximum(row[..., 15:18], 0).astype(np.int64), weight
 
-    def arrays(self, prefix):
+    def arrays(self, prefix: str) -> dict[str, np.ndarray]:
         """The tables of the ports: ``{prefix}_triangles`` float32 and ``{prefix}_cells`` float32."""
         return {
             f"{prefix}_triangles": np.asarray(self.triangles, np.float32),
@@ -152,7 +154,7 @@ class TriangleInterpolation:
         }
 
 
-def barycentric(row, w):
+def barycentric(row: np.ndarray, w: np.ndarray) -> np.ndarray:
     """Unnormalised barycentric coordinates of ``w`` in the triangles of ``row``; (..., 24), (..., 3) -> (..., 3).
 
     Differences to a vertex are taken first: each dual normal is orthogonal to it, and float32 ports keep their
@@ -169,7 +171,7 @@ def barycentric(row, w):
     )
 
 
-def triangulate(vectors):
+def triangulate(vectors: np.ndarray) -> TriangleInterpolation:
     """Spherical Delaunay triangulation of directions and the nadir.
 
     Parameters
@@ -204,7 +206,7 @@ def triangulate(vectors):
     return TriangleInterpolation(interpolation.triangles, _start_cells(interpolation))
 
 
-def _neighbours(simplices):
+def _neighbours(simplices: np.ndarray) -> np.ndarray:
     """Triangle across the edge opposite each vertex; (n, 3) -> (n, 3)."""
     n = len(simplices)
     edges = np.concatenate([simplices[:, [1, 2]], simplices[:, [0, 2]], simplices[:, [0, 1]]])
@@ -218,7 +220,7 @@ def _neighbours(simplices):
     return result
 
 
-def _start_cells(interpolation):
+def _start_cells(interpolation: TriangleInterpolation) -> np.ndarray:
     from btfref.numerics.sphere.parabolic import square_to_hemisphere
 
     centre = (np.arange(START_CELLS) + 0.5) / START_CELLS * 2 - 1
@@ -241,10 +243,12 @@ class ResidentInterpolation:
         For messages.
     """
 
-    def __init__(self, inner, slots, kind="view"):
+    def __init__(
+        self, inner: RingInterpolation | TriangleInterpolation, slots: np.ndarray, kind: str = "view"
+    ) -> None:
         self.inner, self.slots, self.kind = inner, slots[:, 0].astype(np.int64), kind
 
-    def stencil(self, w, **settings):
+    def stencil(self, w: ArrayLike, *, hold: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """As the interpolation's own, in slots.
 
         Raises
@@ -252,7 +256,7 @@ class ResidentInterpolation:
         InputError
             When a sample with weight is not kept.
         """
-        index, weight = self.inner.stencil(w, **settings)
+        index, weight = self.inner.stencil(w, hold=hold)
         slot = self.slots[index]
         absent = slot == MISSING
         needed = absent & (weight > 0)
@@ -265,16 +269,21 @@ class ResidentInterpolation:
         return np.where(absent, 0, slot), weight
 
 
-def whole(interpolation):
+def whole(
+    interpolation: RingInterpolation | TriangleInterpolation | ResidentInterpolation,
+) -> RingInterpolation | TriangleInterpolation:
     """The interpolation whose indices are samples, not slots: that inside of one of which only some are kept."""
     return interpolation.inner if isinstance(interpolation, ResidentInterpolation) else interpolation
 
 
-def from_arrays(arrays, prefix):
+def from_arrays(
+    arrays: Mapping[str, np.ndarray], prefix: str
+) -> RingInterpolation | TriangleInterpolation | ResidentInterpolation:
     """The interpolation whose tables are stored under ``prefix`` (see :meth:`RingInterpolation.arrays`).
 
     With a table ``{prefix}_slots`` its samples are the slots of what is kept: :class:`ResidentInterpolation`.
     """
+    found: RingInterpolation | TriangleInterpolation
     if f"{prefix}_rings" in arrays:
         found = RingInterpolation(arrays[f"{prefix}_rings"])
     else:

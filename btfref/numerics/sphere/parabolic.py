@@ -10,11 +10,12 @@ that no lookup of the hemisphere reads anything else. The ports are :mod:`mitsub
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.precision import real
 
 
-def hemisphere_to_square(w):
+def hemisphere_to_square(w: ArrayLike) -> np.ndarray:
     """Parabolic coordinates ``(s, t) = (w_x, w_y) / (1 + w_z)``, shape (..., 3) -> (..., 2).
 
     The hemisphere fills the unit disc; directions below the horizon fall outside of it.
@@ -23,27 +24,27 @@ def hemisphere_to_square(w):
     return w[..., :2] / (1 + w[..., 2:])
 
 
-def square_to_hemisphere(st):
+def square_to_hemisphere(st: ArrayLike) -> np.ndarray:
     """Inverse of :func:`hemisphere_to_square`, shape (..., 2) -> (..., 3) unit vectors."""
     st = np.asarray(st, float)
     r2 = (st * st).sum(-1, keepdims=True)
     return np.concatenate([2 * st, 1 - r2], -1) / (1 + r2)
 
 
-def solid_angle_density(st):
+def solid_angle_density(st: ArrayLike) -> np.ndarray:
     """Solid angle per unit area of the map, ``4 / (1 + s² + t²)²``, shape (..., 2) -> (...)."""
     st = np.asarray(st, float)
     return 4 / (1 + (st * st).sum(-1)) ** 2
 
 
-def texel_centres(n):
+def texel_centres(n: int) -> np.ndarray:
     """Coordinates (s, t) of the texel centres of an n × n table, shape (n, n, 2)."""
     centre = (np.arange(n) + 0.5) * (2 / n) - 1
     s, t = np.meshgrid(centre, centre)
     return np.stack([s, t], -1)
 
 
-def texel_directions(n):
+def texel_directions(n: int) -> np.ndarray:
     """Directions that the texels of an n × n table stand for, shape (n, n, 3).
 
     Outside of the disc: the nearest point of the horizon.
@@ -52,7 +53,7 @@ def texel_directions(n):
     return square_to_hemisphere(st / np.maximum(np.linalg.norm(st, axis=-1, keepdims=True), 1))
 
 
-def texel_solid_angles(n):
+def texel_solid_angles(n: int) -> np.ndarray:
     """Solid angles of the texels of an n × n table in sr, shape (n, n); sum 2π.
 
     Zero where a texel lies outside of the disc.
@@ -64,7 +65,7 @@ def texel_solid_angles(n):
     return density * (2 * np.pi / density.sum())
 
 
-def bilinear_stencil(w, n):
+def bilinear_stencil(w: ArrayLike, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Texels of an n × n table that a lookup blends, and their weights.
 
     Parameters

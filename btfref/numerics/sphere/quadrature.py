@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 #: Highest degree of the polynomials in (x, y, z) that the weights integrate exactly, where positive weights allow it.
 MAXIMUM_DEGREE = 6
@@ -11,7 +14,7 @@ MAXIMUM_DEGREE = 6
 DENSE_THETA, DENSE_PHI = 96, 256
 
 
-def gauss_hemisphere(n_theta, n_phi):
+def gauss_hemisphere(n_theta: int, n_phi: int) -> tuple[np.ndarray, np.ndarray]:
     """Product rule over the upper hemisphere: Gauss–Legendre in cos θ, equal steps in φ.
 
     Parameters
@@ -33,7 +36,7 @@ def gauss_hemisphere(n_theta, n_phi):
     )
 
 
-def _monomials(w, degree):
+def _monomials(w: ArrayLike, degree: int) -> np.ndarray:
     """Monomials x^i y^j z^k with k ≤ 1 + parity of all degrees up to ``degree``; (n, 3) -> (m, n)."""
     x, y, z = np.asarray(w).T
     # z² = 1 − x² − y² on the sphere, so powers of z above one add nothing.
@@ -48,7 +51,9 @@ def _monomials(w, degree):
     )
 
 
-def hemisphere_weights(vectors, stencil):
+def hemisphere_weights(
+    vectors: np.ndarray, stencil: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+) -> np.ndarray:
     """Positive quadrature weights over the hemisphere for any direction set.
 
     Each sample first gets the solid angle over which the interpolation gives it weight. That rule is then corrected

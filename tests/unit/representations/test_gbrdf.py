@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from probes import hemisphere, hit_allowance, probe_points
 
+from btfref.conventions import luminance
 from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
 from btfref.numerics.microfacets import geometry_factor, isotropic_ndf, schlick
@@ -259,7 +260,7 @@ def test_photograph(rng, tmp_path):
     assert rep.meta["texels"] == [12, 10]
     assert rep.maps["height"].min() == 0
     assert rep.maps["height"].max() == 1
-    bright = np.unravel_index(np.argmax(picture @ [0.2126, 0.7152, 0.0722]), (12, 10))
+    bright = np.unravel_index(np.argmax(luminance(picture)), (12, 10))
     assert rep.maps["height"][bright][0] > 0.8
     # From above, without the highlight, it shows the picture.
     plain = from_photograph(tmp_path / "photo.png", depth=0.0, specular=0.0)
