@@ -14,6 +14,7 @@ import numpy as np
 from btfref.errors import InputError
 from btfref.numerics.sphere import harmonics
 from btfref.scene.environment import Environment, bright_texel, constant, sunsky
+from btfref.scene.shipped import ENVIRONMENTS
 
 #: From the picture's frame, with y up, to the scenes' world with z up.
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -38,9 +39,6 @@ SOFTBOXES = (
 
 #: Radiance of the studio's walls above and below the horizon.
 WALLS, FLOOR = 0.06, 0.03
-
-#: Names for messages; "sky" takes any elevation from 1 to 90.
-NAMES = ("constant", "sky", "sky10", "sky60", "studio", "harmonics", "bright-texel")
 
 
 @cache
@@ -77,13 +75,15 @@ def shipped(name):
         ),
     }
     if name not in makers:
-        raise InputError("no such environment", got=repr(name), expected=f"a file, or {', '.join(NAMES)}")
+        raise InputError(
+            "no such environment", got=repr(name), expected=f"a file, or {', '.join(ENVIRONMENTS)}"
+        )
     return makers[name]()
 
 
 def is_shipped(name):
     """Whether :func:`shipped` knows the name."""
-    return name in NAMES or re.fullmatch(r"sky([1-9]|[1-8]\d|90)", name) is not None
+    return name in ENVIRONMENTS or re.fullmatch(r"sky([1-9]|[1-8]\d|90)", name) is not None
 
 
 def sky_at(elevation, *, shape=(256, 512), turbidity=3.0):

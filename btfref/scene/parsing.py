@@ -13,7 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.scene.shipped import scene_file
+from btfref.representations.file.container import refuse_store
+from btfref.scene.parameters import check_parameters
+from btfref.scene.shipped import ENVIRONMENTS, scene_file
 
 #: The BSDF plugin that shows a representation.
 BTF = "btf"
@@ -156,6 +158,8 @@ def parse(scene, parameters=None, *, variant, size=None, missing_btf=False):
         raise InputError("only scene files have parameters", field="parameters", got=", ".join(parameters))
     if not is_dict and not Path(scene).is_file():
         raise InputError("a folder, not a scene", file=source)
+    if not is_dict:
+        check_parameters(Path(scene), parameters)
     try:
         if is_dict:
             state = mi.parser.parse_dict(config, scene)
@@ -214,6 +218,8 @@ def _resolve_file(parsed, node, beside, missing_btf=False):
         if directory is not None and (directory / name).is_file():
             node.props["filename"] = str((directory / name).resolve())
             return
+        if is_btf and directory is not None:
+            refuse_store(directory / name)
     if node.props.plugin_name() == "envmap":
         _shipped_environment(parsed, node, name)
     if is_btf and not missing_btf:
@@ -224,10 +230,10 @@ def _shipped_environment(parsed, node, name):
     """Give an ``envmap`` the picture of a shipped environment that its file name stands for."""
     import mitsuba as mi
 
-    from btfref.scene.environments import NAMES, is_shipped, shipped
+    from btfref.scene.environments import is_shipped, shipped
 
     if not is_shipped(name):
-        expected = f"a picture, or {', '.join(NAMES)}"
+        expected = f"a picture, or {', '.join(ENVIRONMENTS)}"
         raise InputError(
             "no such environment", file=parsed.location(node), field="filename", got=name, expected=expected
         )

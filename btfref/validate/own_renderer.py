@@ -176,8 +176,10 @@ def representation_for(method, btf=None, *, cache=None):
     """
     from btfref.registry import method as row
     from btfref.representations import save
+    from btfref.representations.file.container import refuse_store
     from btfref.sampling import SampledBTF, open_store
 
+    refuse_store(Path(method))
     if str(method).endswith(".exr"):
         return Path(method)
     found = row(method)

@@ -295,9 +295,21 @@ def map_bytes(name, shape, dtype, meta):
     return width * int(np.prod(shape, dtype=np.int64))
 
 
+def refuse_store(path: Path) -> None:
+    """InputError for a sampled BTF where a representation is wanted, with the command that makes one of it."""
+    if path.is_dir() and (path.name.endswith(".btf.zarr") or (path / "zarr.json").is_file()):
+        stem = path.name.removesuffix(".zarr").removesuffix(".btf")
+        raise InputError(
+            "a sampled BTF, not a representation",
+            file=path,
+            expected=f"one that a fit made: run `btfref fit raw {path} -o {stem}.raw.exr`",
+        )
+
+
 def _open(path, *, header_only):
     """Manifest and parts by name, after every check that needs no pixels."""
     path = Path(path)
+    refuse_store(path)
     if not path.is_file():
         raise InputError("no such file" if not path.exists() else "not a file", file=path)
     if path.stat().st_size == 0:

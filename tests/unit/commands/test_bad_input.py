@@ -249,11 +249,52 @@ def test_what_is_no_store(name, folder, capsys):
         (["render", "good.xml", "-o", "out.exr", "-D", "nonsense=1"], ["nonsense"]),
         (["realtime", "good.xml", "-o", "out.exr", "-D", "nonsense=1"], ["nonsense"]),
         (["realtime", "good.xml", "-o", "out.exr", "-D", "nonsense"], ["nonsense"]),
+        (
+            ["realtime", "plane", "-o", "out.exr", "-D", "lights=foo"],
+            ["foo", "lights", "directional1", "envmap"],
+        ),
+        (
+            ["render", "plane", "-o", "out.exr", "-D", "light=points2"],
+            ["light=points2", "btf, filter, height"],
+        ),
+        (["render", "plane", "-o", "out.exr", "-D", "environment=sky"], ["environment=sky", "lights=envmap"]),
+        (["realtime", "plane", "-o", "out.exr", "-D", "lights=envmap"], ["environment", "studio"]),
+        (
+            [
+                "realtime",
+                "plane",
+                "-o",
+                "out.exr",
+                "-D",
+                "btf=good.exr",
+                "-D",
+                "lights=envmap",
+                "-D",
+                "environment=nowhere",
+            ],
+            ["nowhere", "studio"],
+        ),
         (["info", "none.exr"], ["none.exr"]),
         (["info", "none.png"], ["none.png"]),
     ],
 )
 def test_bad_arguments(arguments, words, folder, capsys):
+    refuse(folder, capsys, *arguments, words=words)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["render", "good.xml", "-o", "out.exr", "-D", "btf=good.btf.zarr"],
+        ["realtime", "good.xml", "-o", "out.exr", "-D", "btf=good.btf.zarr"],
+        ["demand", "good.xml", "-D", "btf=good.btf.zarr"],
+        ["compare", "image.exr", "good.xml", "--method", "good.btf.zarr"],
+        ["export", "good.btf.zarr", "-o", "new", "--format", "maps"],
+    ],
+    ids=lambda arguments: arguments[0],
+)
+def test_a_store_where_a_representation_is_wanted(arguments, folder, capsys):
+    words = ["sampled BTF", "btfref fit raw", "good.btf.zarr -o good.raw.exr"]
     refuse(folder, capsys, *arguments, words=words)
 
 

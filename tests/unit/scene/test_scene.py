@@ -220,7 +220,7 @@ def test_bad_scenes_are_one_line(mi, write, tmp_path, name):
 def test_missing_file_unused_parameter_and_finished_object(mi, write, tmp_path):
     with pytest.raises(InputError, match="no such scene"):
         read_scene(tmp_path / "none.xml")
-    with pytest.raises(InputError, match="unused"):
+    with pytest.raises(InputError, match=r"no such parameter.*unused"):
         read_scene(write(SENSOR), {"unused": "1"})
     with pytest.raises(InputError, match="finished"):
         read_scene({"type": "scene", "c": camera(mi), "s": mi.load_dict({"type": "sphere"})})
