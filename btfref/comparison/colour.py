@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from btfref.images.display import Display
 from btfref.numerics.colour import RGB_TO_XYZ
 
 
-def lab(rgb):
+def lab(rgb: ArrayLike) -> np.ndarray:
     """CIE L*a*b* under D65 of linear Rec. 709 in [0, 1] (CIE 15:2004, 8.2.1).
 
     Parameters
@@ -27,7 +29,7 @@ def lab(rgb):
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
 
 
-def ciede2000(lab1, lab2):
+def ciede2000(lab1: ArrayLike, lab2: ArrayLike) -> np.ndarray:
     """CIEDE2000 colour difference with all parametric factors 1.
 
     Parameters
@@ -65,7 +67,7 @@ def ciede2000(lab1, lab2):
         grey, total, 0.5 * np.where(far, np.where(total < 360, total + 360, total - 360), total)
     )  # eq. 14
 
-    def cosine(multiple, offset):
+    def cosine(multiple: float, offset: float) -> np.ndarray:
         return np.cos(np.radians(multiple * h + offset))
 
     T = 1 - 0.17 * cosine(1, -30) + 0.24 * cosine(2, 0) + 0.32 * cosine(3, 6) - 0.20 * cosine(4, -63)
@@ -77,7 +79,7 @@ def ciede2000(lab1, lab2):
     return np.sqrt(np.maximum(tL**2 + tC**2 + tH**2 + R * tC * tH, 0.0))
 
 
-def delta_e00(test, reference, display):
+def delta_e00(test: ArrayLike, reference: ArrayLike, display: Display) -> np.ndarray:
     """CIEDE2000 between two pictures of linear radiance as a display shows them.
 
     Parameters

@@ -2,20 +2,38 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.comparison import metrics, significance
 from btfref.comparison.colour import delta_e00
 from btfref.comparison.flip import exposure_range, flip_map
+from btfref.comparison.picture_gates import class_codes, judge_pictures
 from btfref.conventions import PixelClass
 from btfref.errors import InputError
 from btfref.gates.tolerances import gate_table, limits, tolerance
 from btfref.gates.verdicts import GateResult, Measured, judge
-from btfref.images.display import fit_display
+from btfref.images.display import Display, fit_display
+from btfref.types import Facts, PathLike
 
 CONFIDENCE = 0.99
+
+
+class HasImage(Protocol):
+    """A picture as a renderer returns it; it may carry its ``variance``, of the mean and of the image's shape."""
+
+    @property
+    def image(self) -> np.ndarray:
+        """Linear Rec. 709, shape (H, W, 3)."""
+
+
+#: What can be compared.
+Side = PathLike | ArrayLike | HasImage
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,23 +62,36 @@ class Comparison:
         Of test - reference.
     """
 
-    metrics: dict
-    gates: tuple = ()
-    settings: dict = field(default_factory=dict)
-    counts: dict = field(default_factory=dict)
-    statistics: dict = field(default_factory=dict)
-    maps: dict = field(default_factory=dict, repr=False)
+    metrics: dict[str, dict[str, float]]
+    gates: tuple[GateResult, ...] = ()
+    settings: Facts = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
+    statistics: dict[str, Facts] = field(default_factory=dict)
+    maps: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
     test: np.ndarray | None = field(default=None, repr=False)
     reference: np.ndarray | None = field(default=None, repr=False)
     classes: np.ndarray | None = field(default=None, repr=False)
     variance: np.ndarray | None = field(default=None, repr=False)
 
     @property
-    def passed(self):
+    def passed(self) -> bool:
         """Whether there are gates and all of them passed."""
         return bool(self.gates) and all(gate.passed for gate in self.gates)
 
-    def to_dict(self):
+    @property
+    def pictures(self) -> tuple[np.ndarray, np.ndarray]:
+        """Test and reference.
+
+        Raises
+        ------
+        ValueError
+            For a comparison of other things than pictures.
+        """
+        if self.test is None or self.reference is None:
+            raise ValueError("no comparison of pictures")
+        return self.test, self.reference
+
+    def to_dict(self) -> Facts:
         """Strict JSON; numbers that are not finite become ``"inf"``, ``"-inf"`` or ``"nan"``."""
         return json_safe(
             {
@@ -77,7 +108,7 @@ class Comparison:
         )
 
 
-def json_safe(value):
+def json_safe(value: object) -> Any:
     """A copy that strict JSON can hold: NumPy values become numbers and lists, non-finite numbers text."""
     if isinstance(value, dict):
         return {str(key): json_safe(entry) for key, entry in value.items()}
@@ -92,7 +123,16 @@ def json_safe(value):
     return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
 
 
-def compare(test, reference, *, classes=None, gate=None, variance=None, display=None, flip=True):
+def compare(
+    test: Side,
+    reference: Side,
+    *,
+    classes: ArrayLike | None = None,
+    gate: str | Sequence[str] | None = None,
+    variance: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
+    display: Display | None = None,
+    flip: bool = True,
+) -> Comparison:
     """Compare two pictures of linear radiance.
 
     Parameters
@@ -192,11 +232,17 @@ def compare(test, reference, *, classes=None, gate=None, variance=None, display=
         classes,
         variance,
     )
-    gates = [result for key in ("image.finite", *keys) for result in _judge(key, comparison, masks)]
+    gates = [result for key in ("image.finite", *keys) for result in judge_pictures(key, comparison, masks)]
     return replace(comparison, gates=tuple(dict.fromkeys(gates)))
 
 
-def agreement(test, reference, *, gate="probe.agreement", allowance=None):
+def agreement(
+    test: ArrayLike,
+    reference: ArrayLike,
+    *,
+    gate: str = "probe.agreement",
+    allowance: ArrayLike | None = None,
+) -> Comparison:
     """Compare lists of values (probes) instead of pictures.
 
     Parameters
@@ -242,26 +288,19 @@ def agreement(test, reference, *, gate="probe.agreement", allowance=None):
     )
 
 
-def _image(side, name):
+def _image(side: Side, name: str) -> tuple[np.ndarray, np.ndarray | None]:
     carried = getattr(side, "variance", None)
-    if hasattr(side, "image"):
-        side = side.image
-    elif isinstance(side, str) or hasattr(side, "__fspath__"):
+    if isinstance(side, str | os.PathLike):
         from btfref.images.files import load_image
 
         side = load_image(side)
-    image = np.asarray(side, np.float64)
+    image = np.asarray(side.image if hasattr(side, "image") else side, np.float64)
     if image.ndim != 3 or image.shape[-1] != 3:
         raise InputError(f"the {name} is no picture", field="shape", got=image.shape, expected="(H, W, 3)")
     return image, carried
 
 
-def _codes():
-    """Pixel class → its number in a class map."""
-    return {kind.label: kind.value for kind in PixelClass}
-
-
-def _class_map(classes, shape):
+def _class_map(classes: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:
     if classes is None:
         return np.full(shape, PixelClass.INTERIOR, np.uint8)
     classes = np.asarray(classes)
@@ -269,13 +308,17 @@ def _class_map(classes, shape):
         raise InputError("class map and picture differ", field="classes", got=classes.shape, expected=shape)
     unknown = sorted(set(np.unique(classes).tolist()) - set(PixelClass))
     if unknown:
-        raise InputError("unknown pixel class", field="classes", got=unknown, expected=_codes())
+        raise InputError("unknown pixel class", field="classes", got=unknown, expected=class_codes())
     return classes.astype(np.uint8)
 
 
-def _variance(variance, carried, shape):
+def _variance(
+    variance: ArrayLike | tuple[ArrayLike, ArrayLike] | None,
+    carried: Sequence[np.ndarray | None],
+    shape: tuple[int, ...],
+) -> np.ndarray | None:
     if variance is None:
-        parts = [v for v in carried if v is not None]
+        parts: list[ArrayLike] = [v for v in carried if v is not None]
     else:
         parts = list(variance) if isinstance(variance, (tuple, list)) else [variance]
     for part in parts:
@@ -283,10 +326,12 @@ def _variance(variance, carried, shape):
             raise InputError(
                 "variance and picture differ", field="variance", got=np.shape(part), expected=shape
             )
-    return sum(np.asarray(part, np.float64) for part in parts) if parts else None
+    return np.sum([np.asarray(part, np.float64) for part in parts], axis=0) if parts else None
 
 
-def _class_metrics(t, r, maps, ssim, peak):
+def _class_metrics(
+    t: np.ndarray, r: np.ndarray, maps: Mapping[str, np.ndarray], ssim: np.ndarray, peak: float
+) -> dict[str, float]:
     found = {"count": len(t), "mean_reference": float(r.mean()), "max_reference": float(np.abs(r).max())}
     for name in ("bias", "bias_fraction", "mae", "rmse", "nrmse", "relmse", "smape"):
         found[name] = getattr(metrics, name)(t, r)
@@ -306,7 +351,9 @@ def _class_metrics(t, r, maps, ssim, peak):
     return found
 
 
-def _class_statistics(t, r, variance, mask, p_values):
+def _class_statistics(
+    t: np.ndarray, r: np.ndarray, variance: np.ndarray, mask: np.ndarray, p_values: np.ndarray
+) -> Facts:
     d, v = (t - r)[mask], variance[mask]
     shared = {"confidence": CONFIDENCE, "correlated": d.shape[-1]}
     mse = significance.mse_interval(d, v, **shared)
@@ -318,105 +365,3 @@ def _class_statistics(t, r, variance, mask, p_values):
             p_values[mask], significance=tolerance("image.difference.significance")
         ).to_dict(),
     }
-
-
-def _judge(key, comparison, masks) -> list[GateResult]:
-    """Apply one gate to a comparison of pictures."""
-    table = gate_table(key)
-    name = table.get("class", PixelClass.INTERIOR.label)
-    wanted = [entry.removeprefix("min_") for entry in limits(table)]
-    if name not in (*_codes(), "all"):
-        raise InputError("unknown pixel class", file="tolerances.toml", field=f"{key}.class", got=name)
-    if wanted == ["nonfinite"]:
-        bad = {side: comparison.counts[f"nonfinite_{side}"] for side in ("test", "reference")}
-        detail = ", ".join(f"{n} in the {side}" for side, n in bad.items() if n)
-        return judge(
-            key,
-            {
-                "nonfinite": Measured(
-                    sum(bad.values()), None, detail and f"pixels that are not finite: {detail}"
-                )
-            },
-            pixel_class=name,
-        )
-    if name not in masks:
-        outcome = "empty" if table.get("may_be_empty") else "fail"
-        detail = f"no finite {name} pixels"
-        return judge(key, dict.fromkeys(wanted, Measured(None, outcome, detail)), pixel_class=name)
-    return judge(
-        key, {w: _measure(w, name, table, comparison, masks[name]) for w in wanted}, pixel_class=name
-    )
-
-
-def _measure(entry, name, table, comparison, mask):
-    t, r = comparison.test[mask], comparison.reference[mask]
-    if entry in metrics.PERCENTILES or entry == "failing_fraction":
-        error = metrics.relative_error(t, r, floor=table.get("floor", metrics.FLOOR)).max(-1)
-        if entry == "failing_fraction":
-            return float(np.mean(error > table["failing_above"]))
-        return metrics.percentiles(error)[entry]
-    if entry.startswith("code_"):
-        return metrics.percentiles(metrics.code_error(t, r).max(-1))[entry.removeprefix("code_")]
-    if entry == "lost_negative":
-        return metrics.lost_negative(t, r)
-    if entry in ("rejected_fraction", "relative_rmse", "relative_tile_bias"):
-        if comparison.variance is None:
-            return Measured(None, "fail", "needs the variance of the reference, none was given")
-        known = np.isfinite(comparison.variance[mask]).all(-1)
-        if not known.all():
-            return Measured(None, "fail", f"variance is not finite at {np.count_nonzero(~known)} pixels")
-        v = comparison.variance[mask]
-        if entry == "rejected_fraction":
-            p = significance.welch_test(t, v, r, 0.0)[1]
-            return significance.difference_test(p, significance=table["significance"]).rejected_fraction
-        if entry == "relative_tile_bias":
-            return _tiles(comparison, mask, table)
-        return _equivalence(t, r, v, table)
-    if entry in comparison.metrics[name]:
-        return comparison.metrics[name][entry]
-    raise InputError(
-        "no such measure", file="tolerances.toml", field=entry, expected=sorted(comparison.metrics[name])
-    )
-
-
-def _equivalence(t, r, variance, table):
-    scale = float(np.mean(np.abs(r)))
-    if scale == 0:
-        return Measured(None, "fail", "the reference is black: no relative error")
-    mse = significance.mse_interval(
-        t - r, variance, confidence=1 - table["significance"], correlated=t.shape[-1]
-    )
-    found = significance.rmse_interval(mse)
-    relative = significance.interval(found.estimate / scale, found.standard_error / scale)
-    relative = significance.Interval(
-        relative.estimate, relative.standard_error, found.low / scale, found.high / scale, mse.confidence
-    )
-    result = significance.equivalence_test(relative, tolerance=table["relative_rmse"])
-    return Measured(
-        relative.estimate,
-        result.outcome,
-        f"{100 * mse.confidence:g} % interval {relative.low:.2e} to {relative.high:.2e}",
-    )
-
-
-def _tiles(comparison, mask, table):
-    scale = float(np.mean(np.abs(comparison.reference[mask])))
-    if scale == 0:
-        return Measured(None, "fail", "the reference is black: no relative error")
-    # What is not looked at may not be finite.
-    difference, variance = (
-        np.where(mask[..., None], image, 0.0)
-        for image in (comparison.test - comparison.reference, comparison.variance)
-    )
-    found = significance.tile_equivalence(
-        difference / scale,
-        variance / scale**2,
-        mask,
-        tolerance=table["relative_tile_bias"],
-        significance=table["significance"],
-    )
-    if found is None:
-        return Measured(None, "empty", "no tile of which a quarter is of the class")
-    worst = found.interval
-    detail = f"interval of the worst tile {worst.low:.2e} to {worst.high:.2e}"
-    return Measured(abs(worst.estimate), found.outcome, detail)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.comparison.metrics import paired
 from btfref.conventions import LUMINANCE
 from btfref.errors import InputError
+from btfref.types import Facts
 
 #: Pixels per degree of visual angle: 0.7 m from a 0.7 m wide display of 3840 pixels, the authors' default.
 PIXELS_PER_DEGREE = 67.02064
@@ -18,14 +20,16 @@ TONEMAPPERS = ("aces", "hable", "reinhard")
 _ACES = (0.6 * 0.6 * 2.51, 0.6 * 0.03, 0.6 * 0.6 * 2.43, 0.6 * 0.59, 0.14)
 
 
-def aces(x):
+def aces(x: ArrayLike) -> np.ndarray:
     """Tone mapping of linear values ≥ 0 to [0, 1] used by HDR-FLIP (Andersson et al. 2021, section 3)."""
     a, b, c, d, e = _ACES
     x = np.asarray(x, np.float64)
     return np.clip((a * x * x + b * x) / (c * x * x + d * x + e), 0.0, 1.0)
 
 
-def exposure_range(reference, mask=None, *, widest=6.0):
+def exposure_range(
+    reference: ArrayLike, mask: np.ndarray | None = None, *, widest: float = 6.0
+) -> tuple[float, float, int]:
     """Start and stop exposure of HDR-FLIP, from the reference alone.
 
     The rule of Andersson et al. 2021: the brightest pixel, and the median pixel, come to 0.85 after ACES tone
@@ -59,15 +63,15 @@ def exposure_range(reference, mask=None, *, widest=6.0):
 
 
 def flip_map(
-    test,
-    reference,
+    test: ArrayLike,
+    reference: ArrayLike,
     *,
-    start=None,
-    stop=None,
-    exposures=None,
-    tonemapper="aces",
-    pixels_per_degree=PIXELS_PER_DEGREE,
-):
+    start: float | None = None,
+    stop: float | None = None,
+    exposures: int | None = None,
+    tonemapper: str = "aces",
+    pixels_per_degree: float = PIXELS_PER_DEGREE,
+) -> tuple[np.ndarray, Facts]:
     """HDR-FLIP error per pixel (Andersson et al. 2021).
 
     Parameters
@@ -133,7 +137,9 @@ def flip_map(
     return np.asarray(errors, np.float32)[..., 0], settings
 
 
-def ldr_flip_map(test, reference, *, pixels_per_degree=PIXELS_PER_DEGREE):
+def ldr_flip_map(
+    test: ArrayLike, reference: ArrayLike, *, pixels_per_degree: float = PIXELS_PER_DEGREE
+) -> np.ndarray:
     """FLIP of linear values in [0, 1] per pixel (Andersson et al. 2020).
 
     Parameters

@@ -7,6 +7,7 @@ entries.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.errors import InputError
 from btfref.numerics.colour import encode_srgb
@@ -22,7 +23,7 @@ FLOOR = 1e-3
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
 
 
-def paired(test, reference):
+def paired(test: ArrayLike, reference: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Both arrays as float64 after the check that they have one shape and are not empty.
 
     Raises
@@ -40,35 +41,35 @@ def paired(test, reference):
     return test.astype(np.float64), reference.astype(np.float64)
 
 
-def bias(test, reference):
+def bias(test: ArrayLike, reference: ArrayLike) -> float:
     """Mean of test - reference, in the unit of the input."""
     t, r = paired(test, reference)
     return float(np.mean(t - r))
 
 
-def mae(test, reference):
+def mae(test: ArrayLike, reference: ArrayLike) -> float:
     """Mean absolute error, in the unit of the input."""
     t, r = paired(test, reference)
     return float(np.mean(np.abs(t - r)))
 
 
-def rmse(test, reference):
+def rmse(test: ArrayLike, reference: ArrayLike) -> float:
     """Root of the mean squared error, in the unit of the input."""
     t, r = paired(test, reference)
     return float(np.sqrt(np.mean((t - r) ** 2)))
 
 
-def nrmse(test, reference):
+def nrmse(test: ArrayLike, reference: ArrayLike) -> float:
     """RMSE divided by the mean absolute reference; against black, infinite for an error and 0 for none."""
     return _ratio(rmse(test, reference), float(np.mean(np.abs(paired(test, reference)[1]))))
 
 
-def bias_fraction(test, reference):
+def bias_fraction(test: ArrayLike, reference: ArrayLike) -> float:
     """Absolute bias divided by the mean absolute reference."""
     return _ratio(abs(bias(test, reference)), float(np.mean(np.abs(paired(test, reference)[1]))))
 
 
-def relmse(test, reference, *, epsilon=RELMSE_EPSILON):
+def relmse(test: ArrayLike, reference: ArrayLike, *, epsilon: float = RELMSE_EPSILON) -> float:
     """Relative mean squared error, mean of (t - r)² / (r² + ε).
 
     Parameters
@@ -87,13 +88,13 @@ def relmse(test, reference, *, epsilon=RELMSE_EPSILON):
     return float(np.mean((t - r) ** 2 / (r**2 + epsilon)))
 
 
-def smape(test, reference, *, epsilon=SMAPE_EPSILON):
+def smape(test: ArrayLike, reference: ArrayLike, *, epsilon: float = SMAPE_EPSILON) -> float:
     """Symmetric mean absolute percentage error in [0, 2], mean of 2|t - r| / (|t| + |r| + ε)."""
     t, r = paired(test, reference)
     return float(np.mean(2 * np.abs(t - r) / (np.abs(t) + np.abs(r) + epsilon)))
 
 
-def psnr(test, reference, *, peak):
+def psnr(test: ArrayLike, reference: ArrayLike, *, peak: float) -> float:
     """Peak signal-to-noise ratio in dB, 20 log10(peak / RMSE); infinite for equal input.
 
     Parameters
@@ -118,7 +119,9 @@ def psnr(test, reference, *, peak):
     return float("inf") if error == 0 else float(20 * np.log10(peak / error))
 
 
-def relative_error(test, reference, *, floor=FLOOR, largest=None):
+def relative_error(
+    test: ArrayLike, reference: ArrayLike, *, floor: float = FLOOR, largest: float | None = None
+) -> np.ndarray:
     """Relative error |t - r| / max(|r|, floor · largest), per entry.
 
     Parameters
@@ -145,13 +148,13 @@ def relative_error(test, reference, *, floor=FLOOR, largest=None):
     )
 
 
-def code_error(test, reference):
+def code_error(test: ArrayLike, reference: ArrayLike) -> np.ndarray:
     """Absolute differences in steps of 8-bit sRGB codes, both clipped to [0, 1]; same shape."""
     t, r = (encode_srgb(np.clip(np.nan_to_num(x), 0.0, 1.0)) for x in paired(test, reference))
     return 255 * np.abs(t - r)
 
 
-def lost_negative(test, reference):
+def lost_negative(test: ArrayLike, reference: ArrayLike) -> float:
     """Largest negative part of the reference that the test lacks, over the largest absolute reference value.
 
     A renderer that clamps in silence hides what a lossy method undershoots, and with it part of its error.
@@ -161,7 +164,7 @@ def lost_negative(test, reference):
     return _ratio(float(np.max(np.maximum(lost, 0))), float(np.max(np.abs(r))))
 
 
-def percentiles(error):
+def percentiles(error: ArrayLike) -> dict[str, float]:
     """Percentiles p50, p99, p999 and max of an error: the smallest entry with that share at or below it.
 
     Parameters
@@ -181,7 +184,7 @@ def percentiles(error):
     return {name: float(ordered[i]) for name, i in zip(PERCENTILES, rank, strict=True)}
 
 
-def ssim_map(test, reference, *, data_range=1.0):
+def ssim_map(test: ArrayLike, reference: ArrayLike, *, data_range: float = 1.0) -> np.ndarray:
     """Structural similarity per pixel and channel (Wang, Bovik, Sheikh and Simoncelli 2004, eq. 13).
 
     Gaussian window of 11 × 11 pixels with a standard deviation of 1.5, K1 = 0.01, K2 = 0.03, population
@@ -216,7 +219,7 @@ def ssim_map(test, reference, *, data_range=1.0):
     )
 
 
-def _window_mean(x):
+def _window_mean(x: np.ndarray) -> np.ndarray:
     """Mean under SSIM's Gaussian window along the first two axes, mirrored at the borders."""
     offsets = np.arange(-5, 6)
     weights = np.exp(-0.5 * (offsets / 1.5) ** 2)
@@ -229,7 +232,7 @@ def _window_mean(x):
     return x
 
 
-def _ratio(value, scale):
+def _ratio(value: float, scale: float) -> float:
     if scale > 0:
         return value / scale
     return float("inf") if value > 0 else 0.0

@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.comparison.colour import delta_e00
 from btfref.comparison.significance import Interval, interval, rmse_interval
 from btfref.comparison.waterfall import CONFIDENCE
+from btfref.images.display import Display
+from btfref.types import Facts
 
 
 @dataclass(frozen=True)
@@ -30,12 +33,12 @@ class StagePart:
     delta_e00: Interval
     pixels: int
 
-    def to_dict(self):
+    def to_dict(self) -> Facts:
         """JSON-able form."""
         return {**vars(self), "rmse": self.rmse.to_dict(), "delta_e00": self.delta_e00.to_dict()}
 
 
-def part(name, of, test, reference, display):
+def part(name: str, of: str, test: ArrayLike, reference: ArrayLike, display: Display) -> StagePart:
     """A part of a stage from pictures without noise at pixels that were drawn at random.
 
     Parameters
@@ -49,9 +52,9 @@ def part(name, of, test, reference, display):
     StagePart
     """
     square = np.mean((np.asarray(test, float) - reference) ** 2, 1)
-    colour, n = delta_e00(test, reference, display), max(len(square), 2)
+    difference, n = delta_e00(test, reference, display), max(len(square), 2)
     mse, colour = (
         interval(x.mean(), x.std() / np.sqrt(n - 1), confidence=CONFIDENCE, freedom=n - 1)
-        for x in (square, colour)
+        for x in (square, difference)
     )
     return StagePart(name, of, rmse_interval(mse), colour, len(square))

@@ -10,12 +10,14 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.comparison.metrics import paired
 from btfref.errors import InputError
+from btfref.types import Facts
 
 
-def sidak(significance, n_tests):
+def sidak(significance: float, n_tests: int) -> float:
     """Level of each of several independent tests, so that all together err with `significance` (Šidák 1967).
 
     Parameters
@@ -34,7 +36,15 @@ def sidak(significance, n_tests):
     return float(-np.expm1(np.log1p(-significance) / n_tests))
 
 
-def welch_test(mean_a, variance_a, mean_b, variance_b, *, n_a=None, n_b=None):
+def welch_test(
+    mean_a: ArrayLike,
+    variance_a: ArrayLike,
+    mean_b: ArrayLike,
+    variance_b: ArrayLike,
+    *,
+    n_a: ArrayLike | None = None,
+    n_b: ArrayLike | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """Two-sided test that two means are equal, entry by entry (Welch 1947; without sample counts a z-test).
 
     Parameters
@@ -97,16 +107,16 @@ class Difference:
     smallest_p: float
 
     @property
-    def rejected_fraction(self):
+    def rejected_fraction(self) -> float:
         """Share of rejected entries."""
         return self.rejected / self.n_tests
 
-    def to_dict(self):
+    def to_dict(self) -> Facts:
         """JSON-able form."""
         return asdict(self) | {"rejected_fraction": self.rejected_fraction}
 
 
-def difference_test(p_values, *, significance):
+def difference_test(p_values: ArrayLike, *, significance: float) -> Difference:
     """Count the entries whose equality is rejected at the Šidák-corrected level.
 
     Parameters
@@ -142,12 +152,14 @@ class Interval:
     high: float
     confidence: float
 
-    def to_dict(self):
+    def to_dict(self) -> Facts:
         """JSON-able form."""
         return asdict(self)
 
 
-def interval(estimate, standard_error, *, confidence=0.99, freedom=None):
+def interval(
+    estimate: float, standard_error: float, *, confidence: float = 0.99, freedom: float | None = None
+) -> Interval:
     """Confidence interval of a normal (or, with degrees of freedom, Student-distributed) estimate.
 
     Returns
@@ -164,7 +176,9 @@ def interval(estimate, standard_error, *, confidence=0.99, freedom=None):
     )
 
 
-def bias_interval(difference, variance, *, confidence=0.99, correlated=1):
+def bias_interval(
+    difference: ArrayLike, variance: ArrayLike, *, confidence: float = 0.99, correlated: int = 1
+) -> Interval:
     """Mean of a difference and its interval.
 
     Parameters
@@ -186,7 +200,9 @@ def bias_interval(difference, variance, *, confidence=0.99, correlated=1):
     return interval(d.mean(), np.sqrt(correlated * v.sum()) / d.size, confidence=confidence)
 
 
-def mse_interval(difference, variance, *, confidence=0.99, correlated=1):
+def mse_interval(
+    difference: ArrayLike, variance: ArrayLike, *, confidence: float = 0.99, correlated: int = 1
+) -> Interval:
     """Mean squared error with the noise taken out, and its interval: mean of d² - v.
 
     For d normal with mean b and known variance v, d² - v is an unbiased estimate of b² and 4 d² v - 2 v²
@@ -210,7 +226,9 @@ def mse_interval(difference, variance, *, confidence=0.99, correlated=1):
     return interval(np.mean(d**2 - v), np.sqrt(correlated * spread) / d.size, confidence=confidence)
 
 
-def mse_interval_from_halves(difference_1, difference_2, *, confidence=0.99):
+def mse_interval_from_halves(
+    difference_1: ArrayLike, difference_2: ArrayLike, *, confidence: float = 0.99
+) -> Interval:
     """Mean squared error with the noise taken out, from two independent halves: mean of (X1 - R1)(X2 - R2).
 
     No variances are needed. With S and D the half sum and the difference of both entries, independent for
@@ -232,7 +250,7 @@ def mse_interval_from_halves(difference_1, difference_2, *, confidence=0.99):
     return interval(np.mean(d1 * d2), np.sqrt(spread) / d1.size, confidence=confidence)
 
 
-def rmse_interval(mse):
+def rmse_interval(mse: Interval) -> Interval:
     """The interval of an RMSE from that of its square; negative ends become 0.
 
     Parameters
@@ -267,16 +285,16 @@ class Equivalence:
     tolerance: float
 
     @property
-    def passed(self):
+    def passed(self) -> bool:
         """True for the outcome ``"pass"`` alone."""
         return self.outcome == "pass"
 
-    def to_dict(self):
+    def to_dict(self) -> Facts:
         """JSON-able form."""
         return {"outcome": self.outcome, "tolerance": self.tolerance, **self.interval.to_dict()}
 
 
-def equivalence_test(measured, *, tolerance):
+def equivalence_test(measured: Interval, *, tolerance: float) -> Equivalence:
     """Two one-sided tests (Schuirmann 1987) of whether a quantity is surely within ± tolerance.
 
     Parameters
@@ -308,7 +326,9 @@ def equivalence_test(measured, *, tolerance):
     return Equivalence(outcome, measured, float(tolerance))
 
 
-def tile_means(image, variance, mask, *, size=8, least=1):
+def tile_means(
+    image: ArrayLike, variance: ArrayLike, mask: np.ndarray, *, size: int = 8, least: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
     """Means and variances of the mean over square tiles: less noise, and a bias of a region shows.
 
     Parameters
@@ -335,14 +355,22 @@ def tile_means(image, variance, mask, *, size=8, least=1):
     count = np.bincount(label, minlength=n)
     used = count >= least
 
-    def total(values):
+    def total(values: np.ndarray) -> np.ndarray:
         return np.stack([np.bincount(label, values[mask][:, c], n) for c in range(channels)], -1)[used]
 
     count = count[used, None]
     return total(x) / count, total(v) / count**2
 
 
-def tile_equivalence(difference, variance, mask, *, tolerance, significance=0.01, size=8):
+def tile_equivalence(
+    difference: ArrayLike,
+    variance: ArrayLike,
+    mask: np.ndarray,
+    *,
+    tolerance: float,
+    significance: float = 0.01,
+    size: int = 8,
+) -> Equivalence | None:
     """Whether the mean difference of every tile is surely within ± tolerance.
 
     Parameters
@@ -373,12 +401,14 @@ def tile_equivalence(difference, variance, mask, *, tolerance, significance=0.01
         outcome = "fail"
     else:
         outcome = "pass" if (np.abs(mean) + half < tolerance).all() else "inconclusive"
-    worst = np.unravel_index(np.abs(mean).argmax(), mean.shape)
-    worst = interval(mean[worst], np.sqrt(spread[worst]), confidence=confidence)
+    place = np.unravel_index(np.abs(mean).argmax(), mean.shape)
+    worst = interval(float(mean[place]), float(np.sqrt(spread[place])), confidence=confidence)
     return Equivalence(outcome, worst, float(tolerance))
 
 
-def tile_half_widths(variance, mask, *, significance=0.01, size=8):
+def tile_half_widths(
+    variance: ArrayLike, mask: np.ndarray, *, significance: float = 0.01, size: int = 8
+) -> np.ndarray:
     """Half widths of the intervals of `tile_equivalence`.
 
     Parameters
@@ -398,7 +428,7 @@ def tile_half_widths(variance, mask, *, significance=0.01, size=8):
     return interval(0.0, 1.0, confidence=1 - sidak(significance, spread.size)).high * np.sqrt(spread)
 
 
-def _with_variance(difference, variance):
+def _with_variance(difference: ArrayLike, variance: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     difference = np.asarray(difference, np.float64)
     d, v = paired(difference, np.broadcast_to(np.asarray(variance, np.float64), difference.shape))
     if not (v >= 0).all():

@@ -13,15 +13,23 @@ identity.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.comparison.colour import delta_e00
 from btfref.comparison.significance import Interval, interval, rmse_interval
 from btfref.errors import InputError
-from btfref.gates.verdicts import Measured, judge
+from btfref.gates.verdicts import GateResult, Measured, judge
+from btfref.images.display import Display
+from btfref.types import Facts
+
+if TYPE_CHECKING:
+    from btfref.comparison.parts import StagePart
 
 #: Of every interval.
 CONFIDENCE = 0.99
@@ -46,9 +54,9 @@ class Picture:
     batches: np.ndarray
 
     @property
-    def mean(self):
+    def mean(self) -> np.ndarray:
         """Mean over the batches, float64 (H, W, 3)."""
-        return np.mean(self.batches, axis=0, dtype=np.float64)
+        return np.asarray(np.mean(self.batches, axis=0, dtype=np.float64))
 
 
 @dataclass(frozen=True)
@@ -73,7 +81,7 @@ class Stage:
     delta_e00: Interval
     delta_e00_so_far: Interval
 
-    def to_dict(self):
+    def to_dict(self) -> Facts:
         """JSON-able form."""
         return {
             key: value.to_dict() if isinstance(value, Interval) else value
@@ -94,11 +102,11 @@ class Product:
         None where a stage has no error to speak of.
     """
 
-    stages: tuple
+    stages: tuple[str, str]
     mse: Interval
     correlation: float | None
 
-    def to_dict(self):
+    def to_dict(self) -> Facts:
         """JSON-able form."""
         return {"stages": list(self.stages), "mse": self.mse.to_dict(), "correlation": self.correlation}
 
@@ -129,29 +137,29 @@ class Waterfall:
     gates : tuple of GateResult
     """
 
-    stages: tuple
+    stages: tuple[Stage, ...]
     total: Interval
     unexplained: Interval
     covariance: Interval
     closure: Interval
-    products: tuple = ()
-    parts: tuple = ()
+    products: tuple[Product, ...] = ()
+    parts: tuple[StagePart, ...] = ()
     mean: float = 0.0
     pixels: int = 0
-    gates: tuple = field(default=())
+    gates: tuple[GateResult, ...] = ()
 
     @property
-    def additive(self):
+    def additive(self) -> bool:
         """Whether the stages alone explain the total within the interval."""
         return self.unexplained.low <= 0 <= self.unexplained.high
 
     @property
-    def explained(self):
+    def explained(self) -> bool:
         """Whether stages and covariances explain the total as far as noise lets tell: its gate passed."""
         return all(gate.passed for gate in self.gates)
 
     @property
-    def explanation(self):
+    def explanation(self) -> str:
         """How the stages make up the total, in shares of its mean square."""
         whole = self.total.estimate
         if not whole > 0:
@@ -175,7 +183,7 @@ class Waterfall:
         apart = f" ± {100 * half:.2g}" if half > 0 else ""
         return f"{text}. Together {_percent(found)}{apart} of the whole, which is measured apart."
 
-    def to_dict(self):
+    def to_dict(self) -> Facts:
         """JSON-able form."""
         return {
             "stages": [stage.to_dict() for stage in self.stages],
@@ -195,20 +203,22 @@ class Waterfall:
         }
 
 
-def _percent(share, *, sign=False):
+def _percent(share: float, *, sign: bool = False) -> str:
     """A share for a reader: two digits, and whole numbers from ten on."""
     digits = 0 if abs(share) >= 0.1 else 1
     return f"{100 * share:{'+' if sign else ''}.{digits}f} %"
 
 
-def _pair(product, whole):
+def _pair(product: Product, whole: float) -> str:
     a, b = product.stages
     verb = "undo" if product.mse.estimate < 0 else "add to"
     known = "" if product.correlation is None else f"correlation {product.correlation:.2f}, "
     return f"{a} and {b} {verb} each other ({known}{_percent(product.mse.estimate / whole, sign=True)})"
 
 
-def waterfall(pictures, mask, display, *, parts=()):
+def waterfall(
+    pictures: Iterable[Picture], mask: ArrayLike, display: Display, *, parts: Iterable[StagePart] = ()
+) -> Waterfall:
     """Errors of the stages between pictures.
 
     Parameters
@@ -276,7 +286,7 @@ def waterfall(pictures, mask, display, *, parts=()):
     )
 
 
-def _quarters(batches):
+def _quarters(batches: np.ndarray) -> np.ndarray:
     """Four independent pictures; one without noise is its own."""
     return np.stack([batches[i::4].mean(0) if len(batches) > 1 else batches[0] for i in range(4)])
 
@@ -288,21 +298,21 @@ class _Pair:
     noise that estimate has few degrees of freedom, and two batches that agree by chance would pass for certain.
     """
 
-    def __init__(self, steps, i, j):
+    def __init__(self, steps: np.ndarray, i: int, j: int) -> None:
         self.half, self.difference = self._halves(steps, i, j)
         self._steps = steps
 
     @staticmethod
-    def _halves(steps, i, j):
+    def _halves(steps: np.ndarray, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
         return 0.5 * (steps[:, i] + steps[:, j]), steps[:, i] - steps[:, j]
 
-    def spreads(self):
+    def spreads(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Half sums and differences of every pair."""
         for i, j in combinations(range(4), 2):
             yield self._halves(self._steps, i, j)
 
 
-def _form(pair, weights):
+def _form(pair: _Pair, weights: np.ndarray) -> Interval:
     """Mean of a quadratic form Σ w_jk e_j e_k of the stages and its interval.
 
     With S the half sums and D the differences of two batches, S·wS − D·wD / 4 is x·wy of the batches x and y: free of
@@ -322,7 +332,7 @@ def _form(pair, weights):
     """
     weights = np.asarray(weights, float)
 
-    def product(a, b):
+    def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return np.sum(a * np.tensordot(weights, b, 1), (0, 2))
 
     mean = product(pair.half, pair.half) - product(pair.difference, pair.difference) / 4
@@ -331,13 +341,13 @@ def _form(pair, weights):
     return interval(mean.sum() / count, np.sqrt(square) / count, confidence=CONFIDENCE)
 
 
-def _difference(a, b):
+def _difference(a: Interval, b: Interval) -> Interval:
     """Interval of the difference of two independent estimates."""
     error = float(np.hypot(a.standard_error, b.standard_error))
     return interval(a.estimate - b.estimate, error, confidence=CONFIDENCE)
 
 
-def _products(stages, pair):
+def _products(stages: Sequence[Stage], pair: _Pair) -> tuple[Product, ...]:
     """Pairs of stages by the size of their mean product."""
     found, n = [], len(stages)
     for j in range(n):
@@ -355,7 +365,7 @@ def _products(stages, pair):
     return tuple(sorted(found, key=lambda p: -abs(p.mse.estimate)))
 
 
-def _delta_e00(test, reference, display):
+def _delta_e00(test: np.ndarray, reference: np.ndarray, display: Display) -> Interval:
     """Mean ΔE00 with the bias of noise taken out by the jackknife over batches (Quenouille 1956), and its interval.
 
     The bias of a mean of n batches falls as 1/n where differences exceed the noise, which is what the jackknife
@@ -363,12 +373,12 @@ def _delta_e00(test, reference, display):
     """
     n = max(len(test), len(reference))
 
-    def mean(batches, left_out):
+    def mean(batches: np.ndarray, left_out: int | None) -> np.ndarray:
         if len(batches) == 1:
             return batches[0]
         return np.delete(batches, left_out, 0).mean(0) if left_out is not None else batches.mean(0)
 
-    def value(left_out):
+    def value(left_out: int | None) -> float:
         return float(np.mean(delta_e00(mean(test, left_out), mean(reference, left_out), display)))
 
     whole = value(None)
