@@ -1,5 +1,6 @@
 # make demo   the whole chain on a small material, and its report    (sets everything up first)
 # make test   the default test suite                                 (sets everything up first)
+# make docs   the documentation as a site: output/site/index.html    (sets Python packages up first)
 
 PYTHON ?= python3
 VENV := .venv
@@ -12,7 +13,7 @@ PYTEST_ARGS ?=
 PACKAGE := $(VENV)/.package
 TESTS := $(VENV)/.tests
 
-.PHONY: help demo test test-long lint setup setup-tests clean
+.PHONY: help demo test test-long lint docs setup setup-tests clean
 help:
 	@sed -n 's/^# make/make/p' Makefile
 
@@ -27,6 +28,11 @@ test-long: setup-tests
 
 lint: $(TESTS)
 	@$(BIN)/ruff check && $(BIN)/ruff format --check && $(BIN)/mypy
+
+# Material for MkDocs prints a notice about MkDocs 2, which this project does not use (pyproject.toml: mkdocs < 2).
+docs: $(TESTS)
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --clean --config-file btfref/docs/mkdocs.yml
+	@echo "output/site/index.html"
 
 setup: $(PACKAGE)
 	@$(BIN)/python -m btfref doctor --mend

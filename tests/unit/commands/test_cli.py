@@ -2,12 +2,9 @@
 
 import json
 import os
-import re
-import shlex
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -340,19 +337,3 @@ def test_info_of_images(tmp_path, capsys):
         facts = json.loads(capsys.readouterr().out)
         assert facts["size"] == [5, 3]
         assert sorted(facts["channels"]) == ["B", "G", "R"]
-
-
-def readme_commands():
-    """The command lines that the README and the pages of the documentation show."""
-    root = Path(__file__).parents[3]
-    texts = [path.read_text() for path in (root / "README.md", *sorted((root / "btfref/docs").glob("*.md")))]
-    return re.findall(r"^btfref .*$", "\n".join(texts), re.MULTILINE)
-
-
-def test_the_readme_shows_commands():
-    assert len(readme_commands()) >= 5
-
-
-@pytest.mark.parametrize("line", readme_commands())
-def test_readme_commands_are_understood(line):
-    assert callable(build_parser().parse_args(shlex.split(line, comments=True)[1:]).run)

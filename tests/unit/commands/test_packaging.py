@@ -58,7 +58,12 @@ def files(folder, *suffixes):
     return sorted(
         path.relative_to(ROOT).as_posix()
         for path in found
-        if path.is_file() and "__pycache__" not in path.parts and (not suffixes or path.suffix in suffixes)
+        if path.is_file()
+        and "__pycache__" not in path.parts
+        and not path.is_relative_to(
+            ROOT / "btfref" / "docs"
+        )  # the site's sources: nothing needs them at run time
+        and (not suffixes or path.suffix in suffixes)
     )
 
 
@@ -74,6 +79,7 @@ def test_wheel_holds_everything(wheel):
 def test_wheel_holds_nothing_else(wheel):
     tops = {name.split("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
     assert tops == {"btfref", "mitsuba_plugins", f"btfref-{__version__}.dist-info"}
+    assert not [name for name in zipfile.ZipFile(wheel).namelist() if name.startswith("btfref/docs/")]
 
 
 def test_installed_wheel_is_the_one_that_runs(installed):
