@@ -9,8 +9,15 @@ from __future__ import annotations
 
 import importlib
 from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, Any
 
 from btfref.errors import InputError
+from btfref.types import Facts, PathLike
+
+if TYPE_CHECKING:
+    from btfref.formats.source import Format, Source
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.store.store import BTFStore
 
 __all__ = [
     "ENTRY_POINT_GROUP",
@@ -36,7 +43,7 @@ FORMATS = {
 ENTRY_POINT_GROUP = "btfref.formats"
 
 
-def names():
+def names() -> list[str]:
     """Names of all formats, built in and from entry points.
 
     Returns
@@ -47,7 +54,7 @@ def names():
     return [*FORMATS, *sorted(name for name in found if name not in FORMATS)]
 
 
-def format_named(name):
+def format_named(name: str) -> Format:
     """The format of that name.
 
     Raises
@@ -66,7 +73,7 @@ def format_named(name):
     )
 
 
-def identify(path):
+def identify(path: PathLike) -> str | None:
     """Name of the format of a file, folder or archive, from its first bytes and the names in it.
 
     Parameters
@@ -89,7 +96,7 @@ def identify(path):
     return next((name for name in names() if format_named(name).recognises(candidate)), None)
 
 
-def open_source(path, *, format=None, **options):
+def open_source(path: PathLike, *, format: str | None = None, **options: object) -> Source:
     """Open a measured BTF; headers only are read.
 
     Parameters
@@ -115,14 +122,14 @@ def open_source(path, *, format=None, **options):
     return format_named(name).open_checked(path, options)
 
 
-def import_btf(path, out, **settings):
+def import_btf(path: PathLike, out: PathLike, **settings: Any) -> BTFStore:
     """Convert a measured BTF to a store: `btfref.formats.convert.import_btf`."""
     from btfref.formats.convert import import_btf as run
 
     return run(path, out, **settings)
 
 
-def export_btf(btf, path, format, **settings):
+def export_btf(btf: BTFStore | SampledBTF, path: PathLike, format: str, **settings: object) -> Facts:
     """Write a sampled BTF in a format of others.
 
     Parameters

@@ -9,28 +9,29 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.formats import open_source
-from btfref.formats.source import MEMORY
+from btfref.formats.source import MEMORY, Source
 from btfref.outputs import require_folder_of
 from btfref.provenance import versions
 from btfref.sampling.store.layout import TILE, remove_leftovers, remove_store
 from btfref.sampling.store.resume import resumable
-from btfref.sampling.store.store import create_store
+from btfref.sampling.store.store import BTFStore, create_store
+from btfref.types import PathLike, Progress
 
 
 def import_btf(
-    path,
-    out,
+    path: PathLike,
+    out: PathLike,
     *,
-    format=None,
-    overwrite=False,
-    dtype="float16",
-    cosine=None,
-    scale=None,
-    rows="up",
-    memory=MEMORY,
-    progress=None,
-    **options,
-):
+    format: str | None = None,
+    overwrite: bool = False,
+    dtype: str = "float16",
+    cosine: str | None = None,
+    scale: float | None = None,
+    rows: str = "up",
+    memory: int = MEMORY,
+    progress: Progress | None = None,
+    **options: object,
+) -> BTFStore:
     """Convert a measured BTF to a store.
 
     Parameters
@@ -116,7 +117,7 @@ def import_btf(
     if out.exists() or out.is_symlink():
         store = resumable(out, source.views, source.lights, attributes, overwrite)
     begun = store is None
-    if begun:
+    if store is None:
         _room_for(source, out, dtype)
         store = create_store(
             out,
@@ -136,7 +137,9 @@ def import_btf(
     return store
 
 
-def _fill(store, source, factors, flip, block, progress):
+def _fill(
+    store: BTFStore, source: Source, factors: np.ndarray, flip: bool, block: int, progress: Progress | None
+) -> None:
     """Write the views that are not there yet."""
     n_lights, tiles = len(source.lights), store.coverage.shape[2:]
     covered = (store.coverage.all(axis=(2, 3)) | ~source.present).all(axis=1)
@@ -166,7 +169,7 @@ def _fill(store, source, factors, flip, block, progress):
             progress(done, len(views), "import")
 
 
-def _check(values, present, source, view, first):
+def _check(values: np.ndarray, present: np.ndarray, source: Source, view: int, first: int) -> None:
     """InputError with the pair of the first value that is not finite."""
     bad = ~np.isfinite(values).all(axis=(1, 2, 3)) & present
     if bad.any():
@@ -178,7 +181,7 @@ def _check(values, present, source, view, first):
         )
 
 
-def _factors(source, included, scale):
+def _factors(source: Source, included: bool, scale: float) -> np.ndarray:
     """Factor from the file's quantity to B, float32 of shape (views, lights)."""
     cosine = np.maximum(source.lights.vectors[:, 2], 0)
     factors = np.repeat(scale * (np.ones_like(cosine) if included else cosine)[None], len(source.views), 0)
@@ -188,7 +191,7 @@ def _factors(source, included, scale):
     return factors.astype(np.float32)
 
 
-def _lights_at_a_time(source, dtype, memory):
+def _lights_at_a_time(source: Source, dtype: str, memory: int) -> int:
     """How many lights are decoded together so that all stays within ``memory``."""
     picture = source.texels[0] * source.texels[1] * 3
     view = picture * len(source.lights) * np.dtype(dtype).itemsize
@@ -206,7 +209,7 @@ def _lights_at_a_time(source, dtype, memory):
     return int(min(len(source.lights), memory // 4 // (16 * picture)))
 
 
-def _room_for(source, out, dtype):
+def _room_for(source: Source, out: Path, dtype: str) -> None:
     """InputError when the disk cannot hold the store."""
     require_folder_of(out)
     need = int(source.present.sum()) * source.texels[0] * source.texels[1] * 3 * np.dtype(dtype).itemsize
@@ -217,7 +220,7 @@ def _room_for(source, out, dtype):
         )
 
 
-def _one_of(field, value, known):
+def _one_of(field: str, value: object, known: tuple[object, ...]) -> None:
     if value not in known:
         expected = " or ".join(str(one) for one in known if one is not None)
         raise InputError("setting of the import", field=field, got=repr(value), expected=expected)

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.outputs import new_folder
 from btfref.registry import method
+from btfref.types import Facts, PathLike
+
+if TYPE_CHECKING:
+    from btfref.representations.protocol import Representation
 
 
-def export_maps(path, out):
+def export_maps(path: PathLike, out: PathLike) -> Facts:
     """Write every map as one OpenEXR image or, beyond four channels, as one per channel.
 
     A method whose maps are made for editing has a way of its own: ``export_maps`` in its row's ``editing``.
@@ -68,7 +73,7 @@ def export_maps(path, out):
     return {"format": "maps", "maps": len(arrays), "images": count}
 
 
-def import_maps(folder):
+def import_maps(folder: PathLike) -> Representation:
     """A representation from a folder of edited maps: that of the method which ``maps.toml`` names.
 
     Raises

@@ -9,19 +9,26 @@ from __future__ import annotations
 
 import hashlib
 import struct
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.formats.reading import Reader
 from btfref.formats.source import Format, Source
-from btfref.numerics.sphere.directions import directions
+from btfref.numerics.sphere.directions import DirectionSet, directions
+from btfref.types import PathLike
+
+if TYPE_CHECKING:
+    from btfref.formats.image_sets.files import Candidate
 
 SCALE = np.array([1.0, 1.15, 1.66]) / 1500
 
 _LARGEST = 4096
 
 
-def recognises(candidate):
+def recognises(candidate: Candidate) -> bool:
     """Whether the counts in front explain the size of the file."""
     if len(candidate.head) < 12:
         return False
@@ -31,7 +38,12 @@ def recognises(candidate):
     )
 
 
-def open_merl(path, *, views="ubo81", lights="ubo81"):
+def open_merl(
+    path: PathLike,
+    *,
+    views: str | DirectionSet | ArrayLike = "ubo81",
+    lights: str | DirectionSet | ArrayLike = "ubo81",
+) -> Source:
     """Open a BRDF file.
 
     Parameters
@@ -52,7 +64,7 @@ def open_merl(path, *, views="ubo81", lights="ubo81"):
         reader.fail("more bytes than the counts explain", "end", got=reader.size, expected=reader.offset)
     views, lights = directions(views), directions(lights)
 
-    def colours(view, first, last):
+    def colours(view: int, first: int, last: int) -> np.ndarray:
         index = cell(lights.vectors[first:last], views.vectors[view], counts)
         with np.errstate(over="ignore"):
             f = (np.maximum(table[:, *index], 0) * SCALE[:, None]).astype(np.float32)
@@ -71,7 +83,9 @@ def open_merl(path, *, views="ubo81", lights="ubo81"):
     )
 
 
-def cell(w_light, w_view, counts):
+def cell(
+    w_light: ArrayLike, w_view: ArrayLike, counts: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cell of the table for pairs of directions.
 
     Parameters

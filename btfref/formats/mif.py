@@ -8,16 +8,22 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.formats.image_sets.angles import arrange
+from btfref.formats.image_sets.angles import Angles, Direction, arrange
 from btfref.formats.image_sets.utia import SCALE, WHITE
 from btfref.formats.reading import Reader
 from btfref.formats.source import LARGEST_COUNT, Format, Source
 from btfref.numerics.colour import decode_srgb, rgb_from_xyz
+from btfref.types import PathLike
+
+if TYPE_CHECKING:
+    from btfref.formats.image_sets.files import Candidate
 
 MAGIC = b"MIF FILE"
 VERSION = 1
@@ -30,12 +36,12 @@ _LARGEST_XML = 64 << 20
 _LARGEST_SIDE = 1 << 16
 
 
-def recognises(candidate):
+def recognises(candidate: Candidate) -> bool:
     """Whether the file starts with the magic chunk."""
     return candidate.head.startswith(MAGIC)
 
 
-def open_mif(path, *, allow_missing=False):
+def open_mif(path: PathLike, *, allow_missing: bool = False) -> Source:
     """Open a container with one BTF; of several the first of the XML.
 
     Parameters
@@ -75,7 +81,7 @@ def open_mif(path, *, allow_missing=False):
         raise InputError("planes of the images", file=path, field="planes", got=planes, expected=3)
     space, white = _colours(root, btf, path)
 
-    def colours(view, first, last):
+    def colours(view: int, first: int, last: int) -> np.ndarray:
         result = np.zeros((last - first, rows, columns, 3), np.float32)
         for slot, light in enumerate(range(first, last)):
             if (view, light) in found.images:
@@ -98,9 +104,11 @@ def open_mif(path, *, allow_missing=False):
     )
 
 
-def _chunks(reader):
+def _chunks(reader: Reader) -> tuple[dict[int, np.ndarray], bytes | None]:
     """Images by index, as arrays into the file, and the XML text."""
-    images, text, first = {}, None, True
+    images: dict[int, np.ndarray] = {}
+    text: bytes | None = None
+    first = True
     while reader.offset < reader.size:
         at = reader.offset
         kind = reader.number("u64", "chunk type")
@@ -129,7 +137,7 @@ def _chunks(reader):
     return images, text
 
 
-def _image(reader, length, n):
+def _image(reader: Reader, length: int, n: int) -> tuple[int, np.ndarray]:
     name = f"image {n}"
     if length < 48:
         reader.fail("chunk too short for an image", f"{name}, chunk length", got=length, expected="≥ 48")
@@ -152,7 +160,7 @@ def _image(reader, length, n):
     return index, reader.array(name, TYPES[kind], shape)
 
 
-def _parse(text, path):
+def _parse(text: bytes, path: PathLike) -> ElementTree.Element:
     # Definitions in a document can expand without end; MIF has none.
     if re.search(rb"<!\s*(DOCTYPE|ENTITY)", text):
         raise InputError("XML with a document type", file=path, field="XML")
@@ -162,7 +170,9 @@ def _parse(text, path):
         raise InputError("damaged XML", file=path, field="XML", got=error) from None
 
 
-def _referred(root, element, name):
+def _referred(
+    root: ElementTree.Element, element: ElementTree.Element, name: str
+) -> ElementTree.Element | None:
     """A child, or what it refers to by the id of an element at the top."""
     child = element.find(name)
     reference = child.get("reference") if child is not None else None
@@ -171,23 +181,25 @@ def _referred(root, element, name):
     return next((one for one in root.iter(name) if one.get("id") == reference), None)
 
 
-def _pairs(root, btf, path):
+def _pairs(
+    root: ElementTree.Element, btf: ElementTree.Element, path: PathLike
+) -> Iterator[tuple[int, Angles]]:
     """(index of the image, (θ_l, φ_l, θ_v, φ_v) in degrees) of each pair."""
     table = _referred(root, btf, "directions")
     items = [] if table is None else table.findall("directions-item")
-    if not 0 < len(items) <= LARGEST_COUNT**2:
+    if table is None or not 0 < len(items) <= LARGEST_COUNT**2:
         raise InputError("no list of directions", file=path, field="directions", got=len(items))
-    order = btf.find("index-map")
+    listed = btf.find("index-map")
     try:
         offset = int(btf.findtext("index-offset") or 0)
-        order = None if order is None else [int(word) for word in (order.text or "").split(",")]
+        order = None if listed is None else [int(word) for word in (listed.text or "").split(",")]
         for number, item in enumerate(items):
             position = int(item.get("index", number))
-            ends = {}
+            ends: dict[str | None, Direction] = {}
             for one in item.findall("direction"):
                 unit = one.get("units", item.get("units", table.get("units", "deg")))
                 factor = {"deg": 1.0, "rad": 180 / np.pi}[unit]
-                theta, phi = (float(one.get(key)) * factor for key in ("theta", "phi"))
+                theta, phi = (float(one.attrib[key]) * factor for key in ("theta", "phi"))
                 if one.get("type") in ends or not (0 <= theta <= 90 and np.isfinite(phi)):
                     raise ValueError(f"directions-item {position}: {one.attrib}")
                 ends[one.get("type")] = (round(theta, 6), round(phi % 360, 6) % 360 if theta else 0.0)
@@ -198,7 +210,7 @@ def _pairs(root, btf, path):
         ) from None
 
 
-def _colours(root, btf, path):
+def _colours(root: ElementTree.Element, btf: ElementTree.Element, path: PathLike) -> tuple[str, float]:
     """Colour space and the Y of white."""
     element = _referred(root, btf, "colors")
     space = "XYZ" if element is None else (element.findtext("color_space") or "XYZ").strip()
@@ -218,7 +230,7 @@ def _colours(root, btf, path):
     return space, white
 
 
-def _linear(image, space, white):
+def _linear(image: np.ndarray, space: str, white: float) -> np.ndarray:
     if image.dtype.kind == "u":
         return decode_srgb(image / np.iinfo(image.dtype).max).astype(np.float32)
     values = image.astype(np.float32)

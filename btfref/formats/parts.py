@@ -2,45 +2,66 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Protocol
+
 import numpy as np
 
 from btfref.errors import InputError
+from btfref.numerics.sphere.directions import DirectionSet
+from btfref.sampling.sampled_btf import SampledBTF
+
+if TYPE_CHECKING:
+    from btfref.sampling.store.store import BTFStore
+
+
+class PartReader(Protocol):
+    """A sampled BTF of which a view or some rows are read at a time."""
+
+    views: DirectionSet
+    lights: DirectionSet
+    texels: tuple[int, int]
+
+    def view(self, view: int) -> np.ndarray:
+        """Values of a view, shape (lights, rows, columns, 3)."""
+        ...
+
+    def rows(self, first: int, last: int) -> np.ndarray:
+        """Values of the rows ``first … last − 1``, shape (views, lights, last − first, columns, 3)."""
+        ...
 
 
 class _Stored:
-    def __init__(self, store):
+    def __init__(self, store: BTFStore) -> None:
         self._store = store
         self.views, self.lights, self.texels = store.views, store.lights, store.texels
 
-    def view(self, view):
+    def view(self, view: int) -> np.ndarray:
         return self._store.read(views=view, variance=False)[0][0]
 
-    def rows(self, first, last):
+    def rows(self, first: int, last: int) -> np.ndarray:
         return self._store.read(rows=slice(first, last), variance=False)[0]
 
 
 class _InMemory:
-    def __init__(self, btf):
+    def __init__(self, btf: SampledBTF) -> None:
         self._values = btf.values
         self.views, self.lights, self.texels = btf.views, btf.lights, btf.texels
 
-    def view(self, view):
+    def view(self, view: int) -> np.ndarray:
         return self._values[view]
 
-    def rows(self, first, last):
+    def rows(self, first: int, last: int) -> np.ndarray:
         return self._values[:, :, first:last]
 
 
-def open_parts(btf):
+def open_parts(btf: BTFStore | SampledBTF) -> PartReader:
     """Parts of a `BTFStore` (which must be complete) or a `SampledBTF`.
 
     Returns
     -------
-    object
-        ``views``, ``lights``, ``texels``; ``view(i)`` of shape (lights, rows, columns, 3) and
-        ``rows(first, last)`` of shape (views, lights, last − first, columns, 3).
+    PartReader
     """
-    if isinstance(getattr(btf, "values", None), np.ndarray):
+    if isinstance(btf, SampledBTF):
         return _InMemory(btf)
     if not btf.complete:
         raise InputError("incomplete", file=btf.path, field="coverage", got=f"{btf.coverage.mean():.1%}")

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import mmap
 import struct
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from btfref.errors import InputError
+from btfref.types import PathLike
 
-_NUMBERS = {"u8": "<B", "u32": "<I", "i32": "<i", "u64": "<Q", "f32": "<f"}
+_NUMBERS = {"u8": "<B", "u32": "<I", "i32": "<i", "u64": "<Q"}
 
 
 class Reader:
@@ -28,7 +32,7 @@ class Reader:
         Of the file.
     """
 
-    def __init__(self, path):
+    def __init__(self, path: PathLike) -> None:
         self.path = Path(path)
         if not self.path.is_file():
             raise InputError("not a file" if self.path.exists() else "no such file", file=path)
@@ -39,12 +43,14 @@ class Reader:
             self.map = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         self.offset = 0
 
-    def fail(self, message, field, *, at=None, got=None, expected=None):
+    def fail(
+        self, message: str, field: str, *, at: int | None = None, got: object = None, expected: object = None
+    ) -> NoReturn:
         """Raise InputError with the field and its offset."""
         at = self.offset if at is None else at
         raise InputError(message, file=self.path, field=f"{field} at byte {at}", got=got, expected=expected)
 
-    def take(self, field, n):
+    def take(self, field: str, n: int) -> int:
         """Offset of the next ``n`` bytes, which are then behind; InputError when the file has fewer."""
         if n > self.size - self.offset:
             self.fail(
@@ -57,8 +63,8 @@ class Reader:
         self.offset += n
         return start
 
-    def number(self, kind, field, low=None, high=None):
-        """One number of a kind u8, u32, i32, u64 or f32, within [low, high]."""
+    def number(self, kind: str, field: str, low: float | None = None, high: float | None = None) -> int:
+        """One number of a kind u8, u32, i32 or u64, within [low, high]."""
         form = _NUMBERS[kind]
         at = self.take(field, struct.calcsize(form))
         (value,) = struct.unpack_from(form, self.map, at)
@@ -67,7 +73,7 @@ class Reader:
             self.fail("value out of range", field, at=at, got=value, expected=expected)
         return value
 
-    def array(self, field, dtype, shape):
+    def array(self, field: str, dtype: DTypeLike, shape: Sequence[int]) -> np.ndarray:
         """Array that looks into the file, shape as given; the check comes before anything is made."""
         dtype = np.dtype(dtype)
         count = 1
@@ -76,12 +82,12 @@ class Reader:
         at = self.take(field, count * dtype.itemsize)
         return np.frombuffer(self.map, dtype, count, at).reshape(shape)
 
-    def text(self, field, n):
+    def text(self, field: str, n: int) -> str:
         """Bytes as text: cut at the first NUL, unknown characters replaced."""
         at = self.take(field, n)
         return self.map[at : at + n].split(b"\0", 1)[0].decode("utf-8", "replace")
 
-    def floats(self, field, shape):
+    def floats(self, field: str, shape: Sequence[int]) -> np.ndarray:
         """As `array` of f32, checked to be finite."""
         at = self.offset
         values = self.array(field, "<f4", shape)

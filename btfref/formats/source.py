@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.errors import InputError
-from btfref.numerics.sphere.directions import NAMED_RINGS, RING_TOLERANCE, checked, directions, spherical
+from btfref.numerics.sphere.directions import (
+    NAMED_RINGS,
+    RING_TOLERANCE,
+    DirectionSet,
+    checked,
+    directions,
+    spherical,
+)
 from btfref.outputs import refuse_existing, require_folder_of
+from btfref.types import Facts, PathLike
+
+if TYPE_CHECKING:
+    from btfref.formats.image_sets.files import Candidate
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.store.store import BTFStore
 
 #: Bytes that a conversion may hold at a time, unless told otherwise.
 MEMORY = 2 << 30
@@ -51,25 +66,24 @@ class Source:
 
     path: Path
     format: str
-    views: object
-    lights: object
-    texels: tuple
-    colours: Callable
+    views: DirectionSet
+    lights: DirectionSet
+    texels: tuple[int, int]
+    colours: Callable[[int, int, int], np.ndarray]
     cosine_included: bool
     scale: float = 1.0
-    facts: dict = field(default_factory=dict)
-    present: np.ndarray | None = None
-    moved: dict = field(default_factory=dict)
+    facts: Facts = field(default_factory=dict)
+    present: np.ndarray = field(default_factory=lambda: np.array(True))
+    moved: dict[tuple[int, int], tuple[float, float]] = field(default_factory=dict)
     fingerprint: str = ""
     memory: int = MEMORY
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         # Damaged values may be infinite or NaN: whoever stores them checks; arithmetic with them is no error here.
         self.colours = np.errstate(over="ignore", invalid="ignore")(self.colours)
-        if self.present is None:
-            self.present = np.ones((len(self.views), len(self.lights)), bool)
+        self.present = np.array(np.broadcast_to(self.present, (len(self.views), len(self.lights))))
 
-    def info(self):
+    def info(self) -> Facts:
         """Facts from the headers; JSON types, keys as those of a store where they mean the same."""
         shape = [len(self.views), len(self.lights), *self.texels, 3]
         return {
@@ -111,17 +125,19 @@ class Format:
 
     name: str
     title: str
-    recognises: Callable
-    open: Callable
-    options: frozenset = frozenset()
-    export: Callable | None = None
-    settings: frozenset = frozenset()
+    recognises: Callable[[Candidate], bool]
+    open: Callable[..., Source]
+    options: frozenset[str] = frozenset()
+    export: Callable[..., Facts] | None = None
+    settings: frozenset[str] = frozenset()
 
-    def open_checked(self, path, options):
+    def open_checked(self, path: PathLike, options: Mapping[str, object]) -> Source:
         """`open` with options that were given (None counts as not given) and that the format knows."""
         return self.open(path, **self._known(options, self.options))
 
-    def export_checked(self, btf, path, settings):
+    def export_checked(
+        self, btf: BTFStore | SampledBTF, path: PathLike, settings: Mapping[str, object]
+    ) -> Facts:
         """`export` likewise, to a path that does not exist."""
         if self.export is None:
             raise InputError("this format is only read", field="format", got=repr(self.name))
@@ -131,7 +147,7 @@ class Format:
         require_folder_of(path)
         return self.export(btf, path, **settings)
 
-    def _known(self, given, known):
+    def _known(self, given: Mapping[str, object], known: frozenset[str]) -> Facts:
         given = {key: value for key, value in given.items() if value is not None}
         for key in given:
             if key not in known:
@@ -143,7 +159,7 @@ class Format:
         return given
 
 
-def direction_set(theta, phi, file):
+def direction_set(theta: ArrayLike, phi: ArrayLike, file: PathLike) -> DirectionSet:
     """Directions of a file, by name where they are a known set.
 
     Parameters

@@ -7,6 +7,7 @@ nothing is clipped, so that reflectance above 1 survives.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 #: Added before a logarithm was taken.
 EPSILON = 1e-5
@@ -32,7 +33,7 @@ YUV_TO_RGB = np.array([[1, 0, 1.13983], [1, -0.39465, -0.5806], [1, 2.03211, 0]]
 _YCOCG_TO_RGB = np.array([[1, 1, -1], [1, 0, 1], [1, -1, -1]])
 
 
-def undo(values, model, mean, matrix):
+def undo(values: np.ndarray, model: int, mean: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """Channels before they were decorrelated.
 
     Parameters
@@ -75,7 +76,7 @@ def undo(values, model, mean, matrix):
     return values @ YUV_TO_RGB.T.astype(dtype)
 
 
-def _spectral(values, model):
+def _spectral(values: np.ndarray, model: int) -> np.ndarray:
     """The first channel is the sum; the others are shares of it (5) or their deviation from equal shares (6)."""
     total, rest, n = values[..., :1], values[..., 1:], values.shape[-1]
     if model == 5:
@@ -85,7 +86,7 @@ def _spectral(values, model):
     return np.concatenate([total - rest.sum(-1, keepdims=True) / n, total + rest * total], -1)
 
 
-def log_yuv(rgb):
+def log_yuv(rgb: ArrayLike) -> np.ndarray:
     """Model 11 of linear colours: log(Y + ε), U / (Y + ε), V / (Y + ε); float32, same shape.
 
     Raises

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.formats.bonn import bdi, colour
-from btfref.formats.parts import open_parts
+from btfref.formats.parts import PartReader, open_parts
 from btfref.formats.source import MEMORY
 from btfref.numerics.solvers.threads import one_blas_thread
 from btfref.outputs import new_file
 from btfref.provenance import __version__
+from btfref.types import Facts, PathLike, Progress
+
+if TYPE_CHECKING:
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.store.store import BTFStore
 
 #: Scan lines per chunk that the owners' writer uses.
 SCAN_LINES = 4
@@ -25,17 +31,17 @@ _PASSES = 2
 
 
 def export_bonn(
-    btf,
-    path,
+    btf: BTFStore | SampledBTF,
+    path: PathLike,
     *,
-    family="DFMF",
-    components=None,
-    error=None,
-    colour_model=0,
-    scalar=2,
-    memory=MEMORY,
-    progress=None,
-):
+    family: str = "DFMF",
+    components: int | None = None,
+    error: float | None = None,
+    colour_model: int = 0,
+    scalar: int = 2,
+    memory: int = MEMORY,
+    progress: Progress | None = None,
+) -> Facts:
     """Write a ``.btf`` file.
 
     Parameters
@@ -77,7 +83,7 @@ def export_bonn(
     return {"format": "bonn", "family": family, **facts, "file_bytes": path.stat().st_size}
 
 
-def _header(source, signature):
+def _header(source: PartReader, signature: bytes) -> bytes:
     """Signature, measurement block (version 4) and directions."""
     text = [f"btfref {__version__}", "path traced or imported", "directional"]
     block = b"".join(line.encode()[:79].ljust(80, b"\0") for line in text)
@@ -93,7 +99,7 @@ def _header(source, signature):
     return signature + block + struct.pack("<I", len(source.views)) + table
 
 
-def _write_bdi(stream, source, memory, progress):
+def _write_bdi(stream: BinaryIO, source: PartReader, memory: int, progress: Progress | None) -> Facts:
     rows, columns = source.texels
     stream.write(_header(source, b"!BDIF06R2!"))
     stream.write(struct.pack("<IIIB", columns, rows, SCAN_LINES, bdi.FULL))
@@ -119,7 +125,15 @@ def _write_bdi(stream, source, memory, progress):
     return {"scan_lines_per_chunk": SCAN_LINES}
 
 
-def _write_dfmf(stream, source, components, error, model, scalar, progress):
+def _write_dfmf(
+    stream: BinaryIO,
+    source: PartReader,
+    components: int | None,
+    error: float | None,
+    model: int,
+    scalar: int,
+    progress: Progress | None,
+) -> Facts:
     if model not in (0, 11):
         raise InputError("colour model", field="colour_model", got=model, expected="0 or 11")
     if scalar not in (2, 4):
@@ -168,7 +182,9 @@ def _write_dfmf(stream, source, components, error, model, scalar, progress):
     }
 
 
-def _factors(source, model, rank, progress):
+def _factors(
+    source: PartReader, model: int, rank: int, progress: Progress | None
+) -> tuple[list[tuple[np.ndarray, np.ndarray, np.ndarray]], np.ndarray]:
     """Balanced factors of each channel and the relative error after 1 … rank components, shape (3, rank).
 
     Subspace iteration over the texels' side, view by view (Halko, Martinsson, Tropp 2011, algorithm 4.4), so that
@@ -213,7 +229,7 @@ def _factors(source, model, rank, progress):
     return factors, reached
 
 
-def _matrices(source, view, model):
+def _matrices(source: PartReader, view: int, model: int) -> list[np.ndarray]:
     """Each channel of a view in the colour model: (lights, texels) float32, the picture's top first."""
     values = source.view(view)[:, ::-1].astype(np.float32)
     if model == 11:

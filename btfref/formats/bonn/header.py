@@ -7,7 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from btfref.formats.reading import Reader
 from btfref.formats.source import LARGEST_COUNT, direction_set
+from btfref.numerics.sphere.directions import DirectionSet
+from btfref.types import Facts, PathLike
 
 #: Signature -> family. Of two that match the longer counts.
 SIGNATURES = {
@@ -37,6 +40,7 @@ class Header:
     signature : bytes
     family : {"DFMF", "FMF", "PVF", "BDI"}
     views, lights : DirectionSet
+        Missing until read.
     texels : tuple of int
         Rows and columns; (0, 0) until read.
     channels : tuple of str
@@ -47,30 +51,30 @@ class Header:
 
     signature: bytes
     family: str
-    views: object = None
-    lights: object = None
-    texels: tuple = (0, 0)
-    channels: tuple = ("R", "G", "B")
+    views: DirectionSet = field(init=False)
+    lights: DirectionSet = field(init=False)
+    texels: tuple[int, int] = (0, 0)
+    channels: tuple[str, ...] = ("R", "G", "B")
     cosine_included: bool = False
-    facts: dict = field(default_factory=dict)
+    facts: Facts = field(default_factory=dict)
 
     @property
-    def n_pairs(self):
+    def n_pairs(self) -> int:
         """Views × lights."""
         return len(self.views) * len(self.lights)
 
     @property
-    def n_texels(self):
+    def n_texels(self) -> int:
         """Rows × columns."""
         return self.texels[0] * self.texels[1]
 
 
-def signature_of(head):
+def signature_of(head: bytes) -> bytes | None:
     """The longest signature that bytes start with, or None."""
     return max((one for one in SIGNATURES if head.startswith(one)), key=len, default=None)
 
 
-def read_header(reader):
+def read_header(reader: Reader) -> Header:
     """Header up to what is particular to a family; for BDI, which goes on differently, up to the directions.
 
     Raises
@@ -99,13 +103,13 @@ def read_header(reader):
     return header
 
 
-def _peek(reader):
+def _peek(reader: Reader) -> int | None:
     return (
         struct.unpack_from("<i", reader.map, reader.offset)[0] if reader.size >= reader.offset + 4 else None
     )
 
 
-def _measurement(reader, header):
+def _measurement(reader: Reader, header: Header) -> None:
     start = reader.offset
     length = reader.number("u32", "length of the measurement block")
     version = reader.number("u32", "version", 1, 16)
@@ -136,40 +140,40 @@ def _measurement(reader, header):
         )
 
 
-def _directions(reader, header):
+def _directions(reader: Reader, header: Header) -> None:
     n_views = reader.number("u32", "number of views", 1, LARGEST_COUNT)
-    views, lights = np.zeros((n_views, 2)), None
+    views, lights = np.zeros((n_views, 2)), np.zeros((0, 2))
     for view in range(n_views):
         views[view] = reader.floats(f"direction of view {view}", (2,))
         n_lights = reader.number("u32", f"number of lights of view {view}", 1, LARGEST_COUNT)
         at = reader.offset
         found = reader.floats(f"lights of view {view}", (n_lights, 2))
-        if lights is not None and not (found.shape == lights.shape and np.allclose(found, lights, 0, 1e-5)):
+        if view and not (found.shape == lights.shape and np.allclose(found, lights, 0, 1e-5)):
             reader.fail(
                 "light directions differ from view to view",
                 f"lights of view {view}",
                 at=at,
                 expected="the same for all views",
             )
-        lights = found if lights is None else lights
-    header.views = direction_set(*views.T, reader.path)
-    header.lights = direction_set(*lights.T, reader.path)
+        lights = lights if view else found
+    header.views = direction_set(views[:, 0], views[:, 1], reader.path)
+    header.lights = direction_set(lights[:, 0], lights[:, 1], reader.path)
 
 
-def _texels(reader, header):
+def _texels(reader: Reader, header: Header) -> None:
     width = reader.number("u32", "width", 1, _LARGEST_SIDE)
     height = reader.number("u32", "height", 1, _LARGEST_SIDE)
     header.texels = height, width
 
 
-def read_rotations(reader, header):
+def read_rotations(reader: Reader, header: Header) -> None:
     """Local frames of texels: their number is reported, the owners' reader applies none either."""
     n = reader.number("u32", "number of rotations", 0, _LARGEST_SIDE * _LARGEST_SIDE - 1)
     reader.floats("rotations", (n, 9))
     header.facts["rotations"] = n
 
 
-def to_rgb(channels, file):
+def to_rgb(channels: tuple[str, ...], file: PathLike) -> np.ndarray | None:
     """Weights (n, 3) from a file's channels to linear Rec. 709, or None where they are R, G and B.
 
     Raises

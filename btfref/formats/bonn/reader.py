@@ -6,25 +6,35 @@ Values are f, or f · cos θ_light where the cosine flag is set; colours are lin
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.formats.bonn import colour
-from btfref.formats.bonn.header import read_header, signature_of, to_rgb
+from btfref.formats.bonn.bdi import BDI
+from btfref.formats.bonn.header import Header, read_header, signature_of, to_rgb
 from btfref.formats.reading import Reader
 from btfref.formats.source import LARGEST_COUNT, Format, Source
+from btfref.types import Facts, PathLike
+
+if TYPE_CHECKING:
+    from btfref.formats.image_sets.files import Candidate
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.store.store import BTFStore
 
 _SCALARS = {2: "<f2", 4: "<f4", 8: "<f8"}
 _LARGEST_RANK = 1 << 16
 
 
-def recognises(candidate):
+def recognises(candidate: Candidate) -> bool:
     """Whether the file starts with one of Bonn's signatures."""
     return signature_of(candidate.head) is not None
 
 
-def open_bonn(path):
+def open_bonn(path: PathLike) -> Source:
     """Open a file of any of the four families.
 
     Parameters
@@ -42,17 +52,12 @@ def open_bonn(path):
     """
     reader = Reader(path)
     header = read_header(reader)
-    if header.family == "BDI":
-        from btfref.formats.bonn.bdi import BDI
-
-        values = BDI(reader, header)
-    else:
-        values = {"DFMF": _DFMF, "FMF": _FMF, "PVF": _PVF}[header.family](reader, header)
+    values = _FAMILIES[header.family](reader, header)
     if reader.offset != reader.size:
         reader.fail("more bytes than the header explains", "end", got=reader.size, expected=reader.offset)
     weights = to_rgb(header.channels, reader.path)
 
-    def colours(view, first, last):
+    def colours(view: int, first: int, last: int) -> np.ndarray:
         with np.errstate(over="ignore", invalid="ignore"):
             found = values.decode(view, first, last)
             if weights is not None:
@@ -79,14 +84,25 @@ def open_bonn(path):
             b"".join((reader.map[: 1 << 20], reader.map[-4096:], str(reader.size).encode()))
         ).hexdigest()[:32],
     )
-    values.source = source
+    if isinstance(values, BDI):
+        values.source = source  # which says how much memory there is
     return source
+
+
+class _Values(Protocol):
+    """What follows a header."""
+
+    facts: Facts
+
+    def decode(self, view: int, first: int, last: int) -> np.ndarray:
+        """Values of the lights ``first … last − 1`` of a view, float32 (lights, texels, channels)."""
+        ...
 
 
 class _Factors:
     """S[K], U[rows][K] and SxV[columns][K] with their sizes in front, looking into the file."""
 
-    def __init__(self, reader, name, pairs, texels):
+    def __init__(self, reader: Reader, name: str, pairs: int, texels: int) -> None:
         at = reader.offset
         self.scalar = _scalar(reader, name)
         rank = reader.number("u32", f"components of {name}", 1, _LARGEST_RANK)
@@ -107,22 +123,19 @@ class _Factors:
         right = reader.array(f"SxV of {name}", _SCALARS[self.scalar], (columns, rank))
         self.rank = rank
         self.of_pairs, self.of_texels = (right, left) if self.transposed else (left, right)
-        self._texels = None
 
-    def cut(self, rank):
+    def cut(self, rank: int) -> None:
         """Use no more than the first ``rank`` components."""
         self.rank = min(self.rank, rank)
         self.of_pairs, self.of_texels = self.of_pairs[:, : self.rank], self.of_texels[:, : self.rank]
 
-    @property
-    def texels(self):
+    @cached_property
+    def texels(self) -> np.ndarray:
         """Rows of the texels' side in float32, converted once: every view needs all of them."""
-        if self._texels is None:
-            self._texels = self.of_texels.astype(np.float32)
-        return self._texels
+        return self.of_texels.astype(np.float32)
 
 
-def _scalar(reader, name):
+def _scalar(reader: Reader, name: str) -> int:
     size = reader.number("u8", f"scalar size of {name}")
     if size not in _SCALARS:
         reader.fail(
@@ -134,7 +147,7 @@ def _scalar(reader, name):
 class _DFMF:
     """One factorization per decorrelated channel."""
 
-    def __init__(self, reader, header):
+    def __init__(self, reader: Reader, header: Header) -> None:
         self._header = header
         reader.number("u32", "components")
         at = reader.offset
@@ -148,13 +161,13 @@ class _DFMF:
         self._mean = reader.floats("colour mean", (3,))
         self._matrix = reader.floats("colour matrix", (3, 3))
         self._factors = [_Factors(reader, f"channel {c}", header.n_pairs, header.n_texels) for c in range(n)]
-        self.facts = {
+        self.facts: Facts = {
             "colour_model": f"{self.model} ({colour.NAMES[self.model]})",
             "components": [one.rank for one in self._factors],
             "scalar_bytes": [one.scalar for one in self._factors],
         }
 
-    def decode(self, view, first, last):
+    def decode(self, view: int, first: int, last: int) -> np.ndarray:
         start = view * len(self._header.lights)
         planes = [
             one.of_pairs[start + first : start + last].astype(np.float32) @ one.texels.T
@@ -166,13 +179,13 @@ class _DFMF:
 class _FMF:
     """One factorization; channels are the fastest part of the rows."""
 
-    def __init__(self, reader, header):
+    def __init__(self, reader: Reader, header: Header) -> None:
         self._header, n = header, len(header.channels)
         version = (
             reader.number("u8", "version of the extended header", 0, 2) if b"ER" in header.signature else 0
         )
         self._log = version >= 1 and reader.number("u32", "dynamic range reduction") != 0
-        self.facts = {"dynamic_range": "log" if self._log else "linear"}
+        self.facts: Facts = {"dynamic_range": "log" if self._log else "linear"}
         if version >= 2:
             width = reader.number("u32", "width of the height map", 0, 1 << 16)
             height = reader.number("u32", "height of the height map", 0, 1 << 16)
@@ -196,7 +209,7 @@ class _FMF:
         self._factors.cut(largest)
         self.facts |= {"components": self._factors.rank, "scalar_bytes": self._factors.scalar}
 
-    def decode(self, view, first, last):
+    def decode(self, view: int, first: int, last: int) -> np.ndarray:
         n, start = len(self._header.channels), view * len(self._header.lights)
         first, last = start + first, start + last
         if self._with_texels:
@@ -211,7 +224,7 @@ class _FMF:
 class _PVF:
     """A principal component analysis per view."""
 
-    def __init__(self, reader, header):
+    def __init__(self, reader: Reader, header: Header) -> None:
         self._header, n = header, len(header.channels)
         if "legacy_slots" in header.facts:
             slots = header.facts.pop("legacy_slots")
@@ -222,7 +235,8 @@ class _PVF:
             reader.fail(
                 "view slots", "view slots", at=reader.offset - 4, got=slots, expected=len(header.views)
             )
-        self._n_channels, self._views = n, []
+        self._n_channels = n
+        self._views: list[tuple[bool, np.ndarray, np.ndarray, np.ndarray]] = []
         sizes = n * len(header.lights), n * header.n_texels
         for view in range(slots):
             name = f"view {view}"
@@ -241,18 +255,18 @@ class _PVF:
                     expected=f"{(header.n_texels, sizes[0])} or {(len(header.lights), sizes[1])}",
                 )
             reader.array(f"eigenvalues of {name}", kind, (rank,))
-            parts = [
+            mean, components, weights = (
                 reader.array(f"{part} of {name}", kind, shape)
                 for part, shape in (
                     ("mean", (dimension,)),
                     ("components", (dimension, rank)),
                     ("weights", (n_weights, rank)),
                 )
-            ]
-            self._views.append((of_lights, *parts))
-        self.facts = {"components": max(parts[2].shape[1] for parts in self._views)}
+            )
+            self._views.append((of_lights, mean, components, weights))
+        self.facts: Facts = {"components": max(components.shape[1] for _, _, components, _ in self._views)}
 
-    def decode(self, view, first, last):
+    def decode(self, view: int, first: int, last: int) -> np.ndarray:
         of_lights, mean, components, weights = self._views[view]
         n = self._n_channels
         if of_lights:
@@ -264,7 +278,15 @@ class _PVF:
         return (values + mean.astype(np.float32)).reshape(last - first, -1, n)
 
 
-def export(btf, path, **settings):
+_FAMILIES: dict[str, Callable[[Reader, Header], _Values]] = {
+    "DFMF": _DFMF,
+    "FMF": _FMF,
+    "PVF": _PVF,
+    "BDI": BDI,
+}
+
+
+def export(btf: BTFStore | SampledBTF, path: PathLike, **settings: Any) -> Facts:
     """Write DFMF or BDI: `btfref.formats.bonn.export`."""
     from btfref.formats.bonn.export import export_bonn
 

@@ -8,13 +8,17 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import PurePosixPath
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.formats.source import LARGEST_COUNT, direction_set
+from btfref.numerics.sphere.directions import DirectionSet
+from btfref.types import PathLike
 
 _ANGLE = re.compile(r"(?<![a-z])(tl|pl|tv|pv)(\d{1,3}(?:\.\d{1,6})?)(?![0-9.]*\d)")
 
@@ -22,28 +26,38 @@ _ANGLE = re.compile(r"(?<![a-z])(tl|pl|tv|pv)(\d{1,3}(?:\.\d{1,6})?)(?![0-9.]*\d
 FARTHEST_MOVE = 30.0
 
 
+#: θ_l, φ_l, θ_v and φ_v in degrees.
+Angles = tuple[float, float, float, float]
+
+#: θ and φ in degrees.
+Direction = tuple[float, float]
+
+#: What stands for an image: its name, or its pixels.
+Image = TypeVar("Image")
+
+
 @dataclass(frozen=True)
-class Grid:
+class Grid(Generic[Image]):
     """Views × lights with the image of each pair.
 
     Parameters
     ----------
     views, lights : DirectionSet
-    images : dict of (int, int) to str
-        Name of the image of (view, light).
+    images : dict of (int, int) to object
+        Image of (view, light): its name, or its pixels.
     moved : dict of (int, int) to (float, float)
         Where the light really stood, polar angle and azimuth in degrees.
     present : ndarray of bool, shape (views, lights)
     """
 
-    views: object
-    lights: object
-    images: dict
-    moved: dict
+    views: DirectionSet
+    lights: DirectionSet
+    images: dict[tuple[int, int], Image]
+    moved: dict[tuple[int, int], Direction]
     present: np.ndarray
 
 
-def angles_of(name):
+def angles_of(name: str) -> Angles | None:
     """(θ_l, φ_l, θ_v, φ_v) in degrees of an image's name, or None.
 
     φ lies in [0, 360); at the pole it is 0, whatever the name says.
@@ -52,13 +66,11 @@ def angles_of(name):
     if len(found) != 4 or len({key for key, _ in found}) != 4:
         return None
     angle = {key: float(text) for key, text in found}
-    result = []
-    for theta, phi in (("tl", "pl"), ("tv", "pv")):
-        result += [angle[theta], angle[phi] % 360 if angle[theta] else 0.0]
-    return tuple(result)
+    light, view = ((angle[t], angle[p] % 360 if angle[t] else 0.0) for t, p in (("tl", "pl"), ("tv", "pv")))
+    return light + view
 
 
-def style_of(names):
+def style_of(names: Iterable[str]) -> str | None:
     """How the first image with angles writes them: "spectral", "utia", "ubo", or None.
 
     "spectral" puts the camera first, "utia" joins light first by underscores, "ubo" is anything else.
@@ -72,7 +84,7 @@ def style_of(names):
     return None
 
 
-def grid(names, file, *, allow_missing=False):
+def grid(names: Iterable[str], file: PathLike, *, allow_missing: bool = False) -> Grid[str]:
     """Views × lights of images by name.
 
     Parameters
@@ -94,7 +106,7 @@ def grid(names, file, *, allow_missing=False):
     InputError
         No image, one pair twice, pairs missing, or directions below the horizon.
     """
-    entries = {}
+    entries: dict[Angles, str] = {}
     for name in names:
         angles = angles_of(name)
         if angles is None:
@@ -111,7 +123,7 @@ def grid(names, file, *, allow_missing=False):
     return arrange(entries, file, allow_missing=allow_missing)
 
 
-def arrange(entries, file, *, allow_missing=False):
+def arrange(entries: Mapping[Angles, Image], file: PathLike, *, allow_missing: bool = False) -> Grid[Image]:
     """Views × lights of images whose directions are known.
 
     Parameters
@@ -154,11 +166,16 @@ def arrange(entries, file, *, allow_missing=False):
             got=f"{int((~present).sum())} of {present.size} missing",
             expected="all (or to allow missing ones)",
         )
-    sets = (direction_set(*np.radians(list(zip(*found, strict=True))), file) for found in (views, lights))
-    return Grid(*sets, images, where, present)
+    sets = []
+    for found in (views, lights):
+        theta, phi = np.radians(found).T
+        sets.append(direction_set(theta, phi, file))
+    return Grid(sets[0], sets[1], images, where, present)
 
 
-def _moved(entries, n_views, file):
+def _moved(
+    entries: Mapping[Angles, object], n_views: int, file: PathLike
+) -> set[tuple[Direction, Direction]]:
     """((θ_l, φ_l), (θ_v, φ_v)) of images whose light was moved out of the camera's way."""
     views_of = defaultdict(set)
     for tl, pl, tv, pv in entries:
@@ -177,7 +194,7 @@ def _moved(entries, n_views, file):
     return moved
 
 
-def _apart(first, second):
+def _apart(first: Direction, second: Direction) -> float:
     """Angle between two directions given in degrees, in degrees."""
     a, b = np.radians(first), np.radians(second)
     cosine = np.cos(a[0]) * np.cos(b[0]) + np.sin(a[0]) * np.sin(b[0]) * np.cos(a[1] - b[1])

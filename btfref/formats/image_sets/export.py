@@ -6,15 +6,23 @@ import io
 import json
 import tempfile
 import zipfile
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.formats.image_sets.reader import NOTE
-from btfref.formats.parts import open_parts
+from btfref.formats.parts import PartReader, open_parts
 from btfref.images import decoding, radiance
+from btfref.numerics.sphere.directions import DirectionSet
 from btfref.outputs import new_file, new_folder
+from btfref.types import Facts, PathLike, Progress
+
+if TYPE_CHECKING:
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.store.store import BTFStore
 
 #: How names are written: pattern of folder and file, and whether it starts with a number.
 _NAMES = {
@@ -24,20 +32,20 @@ _NAMES = {
 
 
 def export_images(
-    btf,
-    path,
+    btf: BTFStore | SampledBTF,
+    path: PathLike,
     *,
-    style,
-    image,
-    encode,
-    divisor,
-    with_cosine,
-    planes=None,
-    quality=95,
-    scale=1.0,
-    moved=0,
-    progress=None,
-):
+    style: str,
+    image: str,
+    encode: Callable[[np.ndarray], np.ndarray],
+    divisor: float,
+    with_cosine: bool,
+    planes: Callable[[np.ndarray], Mapping[str, np.ndarray]] | None = None,
+    quality: int = 95,
+    scale: float = 1.0,
+    moved: int = 0,
+    progress: Progress | None = None,
+) -> Facts:
     """Write a folder (or, when the path ends in ``.zip``, an archive) of decoding.
 
     Parameters
@@ -78,7 +86,8 @@ def export_images(
     if isinstance(quality, bool) or not isinstance(quality, int) or not 1 <= quality <= 100:
         raise InputError("quality of JPEG", field="quality", got=quality, expected="1 to 100")
     angles = {name: _whole_degrees(getattr(source, name), name) for name in ("views", "lights")}
-    path, counts = Path(path), {"images": 0, "clipped": 0, "channels": 0, "lights_moved": 0}
+    path = Path(path)
+    counts: dict[str, float] = {"images": 0, "clipped": 0, "channels": 0, "lights_moved": 0}
     archive = path.suffix.lower() == ".zip"
     new = new_file if archive else new_folder
     with new(path) as draft, _Sink(draft, archive, image in ("jpg", "png", "exr")) as sink:
@@ -105,7 +114,7 @@ def export_images(
     return {"format": style, "pictures": image, "scale": scale, **counts}
 
 
-def _whole_degrees(directions, name):
+def _whole_degrees(directions: DirectionSet, name: str) -> list[tuple[int, int]]:
     """Polar angles and azimuths as whole degrees, which these names are made of."""
     angles = np.degrees([directions.theta, directions.phi]).T
     whole = np.round(angles).astype(int)
@@ -121,7 +130,9 @@ def _whole_degrees(directions, name):
     return [(int(theta), int(phi) if theta else 0) for theta, phi in whole]
 
 
-def _moved_light(source, values, light, degrees):
+def _moved_light(
+    source: PartReader, values: np.ndarray, light: tuple[int, int], degrees: int
+) -> tuple[tuple[int, int], np.ndarray]:
     """Where the light goes, and the picture under it: interpolated between its neighbours."""
     from btfref.numerics.sphere.directions import spherical
 
@@ -131,7 +142,14 @@ def _moved_light(source, values, light, degrees):
     return (theta, phi), np.tensordot(weight, values[index].astype(np.float64), 1).astype(np.float32)
 
 
-def _bytes(values, image, encode, planes, quality, counts):
+def _bytes(
+    values: np.ndarray,
+    image: str,
+    encode: Callable[[np.ndarray], np.ndarray],
+    planes: Callable[[np.ndarray], Mapping[str, np.ndarray]] | None,
+    quality: int,
+    counts: dict[str, float],
+) -> bytes:
     """One picture as bytes; ``counts`` learns how many channels were clipped."""
     counts["channels"] += values.size
     if image in ("jpg", "png"):
@@ -149,27 +167,27 @@ def _bytes(values, image, encode, planes, quality, counts):
     channels = planes(values) if planes else dict(zip("RGB", np.moveaxis(values, -1, 0), strict=True))
     if any(np.abs(plane).max() > 65504 for plane in channels.values()):
         raise InputError("values beyond half floats", field="scale", expected="a larger scale")
-    with tempfile.NamedTemporaryFile(suffix=".exr") as stream:
-        decoding.write_exr(channels, stream.name)
-        return Path(stream.name).read_bytes()
+    with tempfile.NamedTemporaryFile(suffix=".exr") as file:
+        decoding.write_exr(channels, file.name)
+        return Path(file.name).read_bytes()
 
 
 class _Sink:
     """Files of a folder that is there, or of an archive that is made."""
 
-    def __init__(self, target, archive, packed):
+    def __init__(self, target: Path, archive: bool, packed: bool) -> None:
         self.target = target
         method = zipfile.ZIP_STORED if packed else zipfile.ZIP_DEFLATED
         self._zip = zipfile.ZipFile(target, "w", method) if archive else None
 
-    def __enter__(self):
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         if self._zip is not None:
             self._zip.close()
 
-    def add(self, name, data):
+    def add(self, name: str, data: bytes) -> None:
         if self._zip is not None:
             # A fixed time, so that the same BTF gives the same bytes.
             info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))

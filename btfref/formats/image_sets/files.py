@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path, PurePosixPath
 
 from btfref.errors import InputError
+from btfref.types import PathLike
 
 #: More files than any BTF has (151² pairs, a few views each).
 LARGEST_NUMBER = 1 << 20
@@ -37,7 +38,7 @@ class Candidate:
         Of a folder or a zip archive.
     """
 
-    def __init__(self, path):
+    def __init__(self, path: PathLike) -> None:
         self.path = Path(path)
         if not self.path.exists():
             raise InputError("no such file", file=path)
@@ -50,14 +51,14 @@ class Candidate:
                 raise InputError("the file is empty", file=path)
 
     @cached_property
-    def files(self):
+    def files(self) -> Folder | Archive | None:
         """Folder or Archive, or None."""
         if self.path.is_dir() or self.head.startswith((b"PK\x03\x04", b"PK\x05\x06")):
             return files_of(self.path)
         return None
 
 
-def files_of(path):
+def files_of(path: PathLike) -> Folder | Archive:
     """Folder or Archive at a path.
 
     Raises
@@ -74,16 +75,24 @@ def files_of(path):
 
 
 class _Files:
-    """Names relative to the top, sorted, and their sizes: ``sizes``."""
+    """Files by their names relative to the top.
 
-    def fingerprint(self):
+    Attributes
+    ----------
+    sizes : dict of str to int
+        Bytes of each.
+    """
+
+    sizes: dict[str, int]
+
+    def fingerprint(self) -> str:
         """Digest of names and sizes."""
         state = hashlib.sha256()
         for name, size in sorted(self.sizes.items()):
             state.update(f"{name}\0{size}\n".encode("utf-8", "surrogateescape"))
         return state.hexdigest()[:32]
 
-    def images(self):
+    def images(self) -> list[str]:
         """Names that end as pictures do."""
         return [name for name in sorted(self.sizes) if name.lower().endswith(IMAGES)]
 
@@ -91,7 +100,7 @@ class _Files:
 class Folder(_Files):
     """Files of a folder and the folders in it; links to folders are not followed."""
 
-    def __init__(self, path):
+    def __init__(self, path: PathLike) -> None:
         self.path = Path(path)
         self.sizes = {}
         for top, _, names in os.walk(self.path):
@@ -102,11 +111,11 @@ class Folder(_Files):
             if len(self.sizes) > LARGEST_NUMBER:
                 raise InputError("too many files", file=path, expected=f"at most {LARGEST_NUMBER}")
 
-    def where(self, name):
+    def where(self, name: str) -> Path:
         """Path of a file, for errors."""
         return self.path / name
 
-    def read(self, name):
+    def read(self, name: str) -> bytes:
         """Bytes of a file."""
         if self.sizes[name] > LARGEST_FILE:
             raise InputError(
@@ -121,7 +130,7 @@ class Folder(_Files):
 class Archive(_Files):
     """Files of a zip archive, every name and size of which was checked before anything is unpacked."""
 
-    def __init__(self, path):
+    def __init__(self, path: PathLike) -> None:
         self.path = Path(path)
         try:
             self._zip = zipfile.ZipFile(self.path)
@@ -168,11 +177,11 @@ class Archive(_Files):
         if packed > size:  # entries that share their bytes
             raise InputError("entries overlap", file=path, got=f"{packed} bytes packed", expected=f"≤ {size}")
 
-    def where(self, name):
+    def where(self, name: str) -> str:
         """Path of a file, for errors."""
         return f"{self.path}/{name}"
 
-    def read(self, name):
+    def read(self, name: str) -> bytes:
         """Bytes of a file; never more than the directory promised."""
         entry = self._entries[name]
         try:

@@ -3,29 +3,44 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.formats.image_sets.angles import grid, style_of
-from btfref.formats.image_sets.files import files_of
+from btfref.formats.image_sets.files import Archive, Candidate, Folder, files_of
 from btfref.formats.source import Source
 from btfref.images import decoding
+from btfref.types import Facts, PathLike
+
+#: ``to_linear(pixels, channels, where)``: linear Rec. 709, float32 (rows, columns, 3).
+ToLinear = Callable[[np.ndarray, tuple[str, ...], PathLike], np.ndarray]
 
 #: Our own note beside exported images: what 8 bits and names cannot say. Other readers pass it over.
 NOTE = "btfref.json"
 
 
-def recogniser(style):
+def recogniser(style: str) -> Callable[[Candidate], bool]:
     """``recognises(candidate)`` of folders and archives whose names are of that style."""
 
-    def recognises(candidate):
+    def recognises(candidate: Candidate) -> bool:
         return candidate.files is not None and style_of(candidate.files.images()) == style
 
     return recognises
 
 
-def image_source(path, name, to_linear, *, cosine_included, scale, allow_missing=False, facts=None):
+def image_source(
+    path: PathLike,
+    name: str,
+    to_linear: ToLinear,
+    *,
+    cosine_included: bool,
+    scale: float,
+    allow_missing: bool = False,
+    facts: Mapping[str, Any] | None = None,
+) -> Source:
     """A source of one image per pair.
 
     Parameters
@@ -53,7 +68,7 @@ def image_source(path, name, to_linear, *, cosine_included, scale, allow_missing
     note = _note(files)
     texels = rows, columns
 
-    def colours(view, start, stop):
+    def colours(view: int, start: int, stop: int) -> np.ndarray:
         result = np.zeros((stop - start, rows, columns, 3), np.float32)
         for slot, light in enumerate(range(start, stop)):
             image = found.images.get((view, light))
@@ -84,7 +99,7 @@ def image_source(path, name, to_linear, *, cosine_included, scale, allow_missing
     )
 
 
-def _note(files):
+def _note(files: Folder | Archive) -> Facts:
     """Entries of our note that are valid, or none."""
     if NOTE not in files.sizes:
         return {}
@@ -98,7 +113,7 @@ def _note(files):
     return {"scale": scale, "cosine_included": included}
 
 
-def pick(channels, names, where):
+def pick(channels: Sequence[str], names: Sequence[str], where: PathLike) -> list[int]:
     """Indices of named channels.
 
     Raises

@@ -7,19 +7,21 @@ Reflectance becomes linear Rec. 709 under D65: `btfref.numerics.colour.spectral_
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.formats.image_sets.reader import image_source, pick, recogniser
-from btfref.formats.source import Format
+from btfref.formats.source import Format, Source
 from btfref.numerics.colour import spectral_weights
+from btfref.types import PathLike
 
 _WAVELENGTH = re.compile(r"(?:[a-zA-Z]*[._])?(\d{3,4}(?:[.,]\d+)?) ?(?:nm)?")
 
 
-def wavelengths(names, where):
+def wavelengths(names: Sequence[str], where: PathLike | None) -> list[float]:
     """Wavelengths in nm of channel names such as "550", "550.0nm" or "S0.550,0nm".
 
     Raises
@@ -27,8 +29,9 @@ def wavelengths(names, where):
     InputError
         A name that is none, one beyond 300 to 1100 nm, or one twice.
     """
-    found = [_WAVELENGTH.fullmatch(re.sub(r"^S\d\.", "", name.strip())) for name in names]
-    if not names or not all(found):
+    matches = (_WAVELENGTH.fullmatch(re.sub(r"^S\d\.", "", name.strip())) for name in names)
+    found = [match for match in matches if match]
+    if not names or len(found) < len(names):
         raise InputError(
             "channels are no wavelengths",
             file=where,
@@ -49,11 +52,11 @@ def wavelengths(names, where):
 
 
 @cache
-def _weights(names):
+def _weights(names: tuple[str, ...]) -> np.ndarray:
     return spectral_weights(wavelengths(names, None)).astype(np.float32)
 
 
-def open_spectral(path, *, allow_missing=False):
+def open_spectral(path: PathLike, *, allow_missing: bool = False) -> Source:
     """Open a folder or zip archive.
 
     Parameters
@@ -67,7 +70,7 @@ def open_spectral(path, *, allow_missing=False):
     Source
     """
 
-    def to_linear(pixels, channels, where):
+    def to_linear(pixels: np.ndarray, channels: tuple[str, ...], where: PathLike) -> np.ndarray:
         if pixels.dtype == np.uint8 or set(channels) == {"R", "G", "B"}:
             raise InputError(
                 "picture without wavelengths", file=where, field="channels", got=", ".join(channels)

@@ -6,16 +6,23 @@ of these sets take them; Radiance and OpenEXR pictures are linear Rec. 709.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.formats.image_sets.reader import image_source, pick, recogniser
-from btfref.formats.source import Format
+from btfref.formats.source import Format, Source
+from btfref.types import Facts, PathLike
+
+if TYPE_CHECKING:
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.store.store import BTFStore
 
 GAMMA = 2.2
 
 
-def open_ubo(path, *, allow_missing=False, gamma=GAMMA):
+def open_ubo(path: PathLike, *, allow_missing: bool = False, gamma: float = GAMMA) -> Source:
     """Open a folder or zip archive.
 
     Parameters
@@ -35,7 +42,7 @@ def open_ubo(path, *, allow_missing=False, gamma=GAMMA):
     curve = (np.arange(256) / 255).astype(np.float64) ** gamma
     curve = curve.astype(np.float32)
 
-    def to_linear(pixels, channels, where):
+    def to_linear(pixels: np.ndarray, channels: tuple[str, ...], where: PathLike) -> np.ndarray:
         if pixels.dtype == np.uint8:
             return curve[pixels]
         return pixels[..., pick(channels, ("R", "G", "B"), where)]
@@ -51,7 +58,7 @@ def open_ubo(path, *, allow_missing=False, gamma=GAMMA):
     )
 
 
-def export(btf, path, **settings):
+def export(btf: BTFStore | SampledBTF, path: PathLike, **settings: Any) -> Facts:
     """Write pictures: `btfref.formats.image_sets.export.export_images` with names of UBO2003."""
     from btfref.formats.image_sets.export import export_images
 
@@ -62,7 +69,7 @@ def export(btf, path, **settings):
         )
     gamma = settings.pop("gamma")
 
-    def encode(values):
+    def encode(values: np.ndarray) -> np.ndarray:
         return np.round(255 * np.clip(values, 0, 1) ** (1 / gamma)).astype(np.uint8)
 
     return export_images(btf, path, style="ubo", encode=encode, divisor=1.0, with_cosine=True, **settings)

@@ -7,12 +7,20 @@ negative channels of colours outside that gamut.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.errors import InputError
 from btfref.formats.image_sets.reader import image_source, pick, recogniser
-from btfref.formats.source import Format
+from btfref.formats.source import Format, Source
 from btfref.numerics.colour import RGB_TO_XYZ, decode_srgb, encode_srgb, rgb_from_xyz
+from btfref.types import Facts, PathLike
+
+if TYPE_CHECKING:
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.store.store import BTFStore
 
 #: XYZ of a perfect diffuser has this Y.
 WHITE = 100.0
@@ -21,17 +29,17 @@ WHITE = 100.0
 SCALE = 1 / np.pi
 
 
-def xyz_to_rgb(pixels):
+def xyz_to_rgb(pixels: ArrayLike) -> np.ndarray:
     """Linear Rec. 709 of UTIA's XYZ (white at Y = 100), same shape, float32."""
     return rgb_from_xyz(np.asarray(pixels, np.float32) / np.float32(WHITE)).astype(np.float32)
 
 
-def rgb_to_xyz(values):
+def rgb_to_xyz(values: ArrayLike) -> np.ndarray:
     """UTIA's XYZ of linear Rec. 709, same shape."""
     return np.asarray(values) @ RGB_TO_XYZ.T * WHITE
 
 
-def open_utia(path, *, allow_missing=False):
+def open_utia(path: PathLike, *, allow_missing: bool = False) -> Source:
     """Open a folder or zip archive.
 
     Parameters
@@ -46,7 +54,7 @@ def open_utia(path, *, allow_missing=False):
     """
     curve = decode_srgb(np.arange(256) / 255).astype(np.float32)
 
-    def to_linear(pixels, channels, where):
+    def to_linear(pixels: np.ndarray, channels: tuple[str, ...], where: PathLike) -> np.ndarray:
         if pixels.dtype == np.uint8:
             return curve[pixels]
         # Writers that know three channels only call X, Y and Z by the names of colours.
@@ -58,7 +66,7 @@ def open_utia(path, *, allow_missing=False):
     )
 
 
-def export(btf, path, **settings):
+def export(btf: BTFStore | SampledBTF, path: PathLike, **settings: Any) -> Facts:
     """Write pictures: `btfref.formats.image_sets.export.export_images` with names of UTIA."""
     from btfref.formats.image_sets.export import export_images
 
@@ -66,10 +74,10 @@ def export(btf, path, **settings):
     if settings["image"] not in ("png", "exr"):
         raise InputError("kind of picture", field="image", got=settings["image"], expected="png or exr")
 
-    def encode(values):
+    def encode(values: np.ndarray) -> np.ndarray:
         return np.round(255 * encode_srgb(np.clip(values, 0, 1))).astype(np.uint8)
 
-    def planes(values):
+    def planes(values: np.ndarray) -> dict[str, np.ndarray]:
         return dict(zip("XYZ", np.moveaxis(rgb_to_xyz(values), -1, 0), strict=True))
 
     return export_images(
