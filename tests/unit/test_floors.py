@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[2]
 #: From the top floor down. A module belongs to the longest prefix that names it; modules of one floor may import
 #: each other where they share a line's package, and nothing that stands on a line above.
 FLOORS = """
-btfref.__main__
+btfref.__main__ btfref.docs
 btfref.cli
 btfref.commands btfref.pytest_plugin
 btfref.bench btfref.demo btfref.testing

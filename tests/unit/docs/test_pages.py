@@ -159,3 +159,9 @@ def test_the_reference_shows_docstrings(site):
     text = (folder / "api" / "index.html").read_text("utf-8")
     assert "btfref.fit" in text
     assert "Compress a sampled BTF" in text
+
+
+def test_roles_of_docstrings_are_plain_code(site):
+    folder, _ = site
+    for path in (folder / "api").glob("*.html"):
+        assert re.findall(r":(?:class|func|meth|mod|data|attr):<code>", path.read_text("utf-8")) == []
