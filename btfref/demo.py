@@ -22,16 +22,9 @@ METHODS = ("lpca", "svd", "raw")
 #: The scene that `btfref.rendering.offline.geometry` can replace by the mesostructure itself.
 FLAT = "plane"
 
-#: 64 × 64 texels and 81 × 81 directions; 16 paths leave a noise that the eye finds and the gates do not mind,
-#: since every renderer shows the same noisy material.
-SYNTHESIS = {
-    "mesostructure": "checker",
-    "texels": 64,
-    "views": "ubo81",
-    "lights": "ubo81",
-    "spp": 16,
-    "seed": 0,
-}
+#: What is synthesized: 64 × 64 texels and 81 × 81 directions, the default. 16 paths leave a noise that the eye finds
+#: and the gates do not mind, since every renderer shows the same noisy material.
+MESOSTRUCTURE, SPP = "checker", 16
 
 #: Sub-pixels per axis, the same in both renderers.
 GRID = 4
@@ -141,6 +134,7 @@ class _Chain:
     truths: dict = field(default_factory=dict)
     seconds: dict = field(default_factory=dict)
     renderers: dict = field(default_factory=dict)
+    synthesis: dict = field(default_factory=dict)
 
     @contextlib.contextmanager
     def timed(self, stage):
@@ -155,16 +149,20 @@ class _Chain:
         """Sampled BTF and representations."""
         from btfref.registry import method
         from btfref.representations.file.container import save
+        from btfref.sampling.settings import SynthesisSettings
         from btfref.sampling.synthesis import synthesize
 
         with self.timed("synthesis"):
             # The folder is the demo's own: a store that another version of it made is replaced.
             store = self.output / "checker.btf.zarr"
-            btf = synthesize(**SYNTHESIS, out=store, overwrite=True, progress=self.progress)
+            settings = SynthesisSettings(spp=SPP)
+            btf = synthesize(MESOSTRUCTURE, settings, out=store, overwrite=True, progress=self.progress)
+            told = ("texels", "views", "lights", "spp", "seed")
+            self.synthesis = {"mesostructure": MESOSTRUCTURE} | {k: getattr(settings, k) for k in told}
         for key in METHODS:
             with self.timed(f"fit {key}"):
                 self.files[key] = (self.output / f"checker.{key}.exr").resolve()
-                save(method(key).fit(btf, seed=SYNTHESIS["seed"], progress=self.progress), self.files[key])
+                save(method(key).fit(btf, seed=settings.seed, progress=self.progress), self.files[key])
 
     def arguments(self, method, scene, lights):
         """What every renderer is called with."""
@@ -239,7 +237,7 @@ class _Chain:
 
         sizes = {key: read_info(file) for key, file in self.files.items()}
         return {
-            "synthesis": SYNTHESIS,
+            "synthesis": self.synthesis,
             "representations": {
                 key: f"{info['payload_bytes']} bytes, 1:{info['ratio']:.4g}" for key, info in sizes.items()
             },

@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cache
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from btfref.registry import Method
 
 __version__ = "0.2.0"
 
@@ -16,18 +23,23 @@ RELEVANT = (
     "zarr",
     "trimesh",
     "moderngl",
-    "scikit-image",
+    "scikit-learn",
+    "PyMaxflow",
     "flip-evaluator",
 )
 
+#: The library that compiles the kernels of Mitsuba's llvm variants; no distribution of Python's, so asked for apart.
+#: Likewise the OpenGL driver, which only those know who have a context: it stands in what they make, as ``gl_…``.
+LLVM = "LLVM"
 
-def versions(names=RELEVANT):
-    """Versions of btfref, Python and installed distributions, read from metadata without importing them.
+
+def versions(names: Iterable[str] = (*RELEVANT, LLVM)) -> dict[str, str | None]:
+    """Versions of btfref, Python and what is installed, read from metadata without importing anything of it.
 
     Parameters
     ----------
     names : iterable of str, optional
-        Distribution names; those not installed map to None.
+        Names of distributions, and `LLVM` for the library that Dr.Jit is given; what is not there maps to None.
 
     Returns
     -------
@@ -37,13 +49,25 @@ def versions(names=RELEVANT):
     import platform
     from importlib import metadata
 
-    found = {"btfref": __version__, "python": platform.python_version()}
+    found: dict[str, str | None] = {"btfref": __version__, "python": platform.python_version()}
     for name in names:
         try:
-            found[name] = metadata.version(name)
+            found[name] = _llvm() if name == LLVM else metadata.version(name)
         except metadata.PackageNotFoundError:
             found[name] = None
     return found
+
+
+def _llvm() -> str | None:
+    """Major version of LLVM, or the file where its name does not tell."""
+    from pathlib import Path
+
+    from btfref.platform import choose_llvm
+
+    choice = choose_llvm()
+    if choice.path is None or choice.version is not None:
+        return None if choice.version is None else str(choice.version)
+    return Path(choice.path).name
 
 
 #: Stage → the code that its results depend on, besides that of the stages before: folders and files of the packages.
@@ -73,7 +97,7 @@ BEFORE = {"material": (), "fit": ("material",), "picture": ("material", "fit")}
 
 
 @cache
-def code_of(stage, method=None):
+def code_of(stage: str, method: str | None = None) -> str:
     """Hash of the code that results of a stage depend on.
 
     Parameters
@@ -107,7 +131,7 @@ def code_of(stage, method=None):
     return digest.hexdigest()
 
 
-def method_files(row):
+def method_files(row: Method) -> list[Path]:
     """Files of a method: fit module, Dr.Jit port, GLSL port; all of its package where that is a third party's."""
     import importlib.util
     from pathlib import Path
@@ -116,19 +140,22 @@ def method_files(row):
 
     found = []
     for module in (row.module, row.plugin):
-        place = Path(importlib.util.find_spec(module).origin)
+        spec = importlib.util.find_spec(module)
+        if spec is None or spec.origin is None:
+            raise ModuleNotFoundError(f"no file of module {module!r}", name=module)
+        place = Path(spec.origin)
         if module.split(".")[0] in ("btfref", "mitsuba_plugins"):
             found.append(place)
         else:
             top = importlib.util.find_spec(module.split(".")[0])
-            roots = list(top.submodule_search_locations or [])
+            roots = [] if top is None else list(top.submodule_search_locations or [])
             found += [p for root in roots for p in Path(root).rglob("*") if _is_code(p)] or [place]
     if not row.shader_package:
         found.append(shader_directory() / row.shader)
     return [path.resolve() for path in found]
 
 
-def _files(place):
+def _files(place: str) -> list[Path]:
     from pathlib import Path
 
     from btfref.platform import shader_directory
@@ -140,5 +167,5 @@ def _files(place):
     )
 
 
-def _is_code(path):
+def _is_code(path: Path) -> bool:
     return path.suffix in (".py", ".glsl", ".vert", ".frag", ".toml", ".xml", ".ply", ".csv")

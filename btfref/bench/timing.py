@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 from btfref.provenance import versions
+from btfref.sampling.memory import of_this_process
 
 
 def machine():
@@ -104,19 +105,11 @@ def reset_peak():
     """Start counting the peak of the process anew; what it holds now in bytes, or None."""
     try:
         Path("/proc/self/clear_refs").write_text("5")
-        return _status("VmRSS")
+        return of_this_process("VmRSS")
     except OSError:
         return None
 
 
 def peak_memory():
     """Most that the process held since :func:`reset_peak`, bytes, or None."""
-    return _status("VmHWM")
-
-
-def _status(field):
-    try:
-        lines = Path("/proc/self/status").read_text().splitlines()
-    except OSError:
-        return None
-    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(field + ":")), None)
+    return of_this_process("VmHWM")

@@ -32,6 +32,7 @@ from btfref.commands._shared import (
 )
 from btfref.commands.demand import add_scene_arguments, union, whole_shape
 from btfref.errors import InputError
+from btfref.sampling.settings import DTYPES, ESTIMATORS, MOST_SAMPLES, SAMPLES, SynthesisSettings
 
 #: Options that are parameters of a user's mesh or height map.
 _OWN = ("bsdf", "albedo", "roughness", "amplitude", "tile", "up", "allow_seams")
@@ -46,20 +47,26 @@ def add_arguments(parser):
         "height map (PNG of 8 or 16 bits, OpenEXR)",
     )
     parser.add_argument("-o", "--output", required=True, metavar="OUT.btf.zarr", help="the store to write")
+    default = SynthesisSettings  # its fields' defaults, as attributes of the class
     parser.add_argument(
-        "--texels", type=count(1), default=64, metavar="N", help="texels per side (default 64)"
+        "--texels",
+        type=count(1),
+        default=default.texels,
+        metavar="N",
+        help="texels per side (default %(default)s)",
     )
     directions = (
-        "ubo81, ubo151, a grid such as 10x5, or a .txt file of theta and phi in degrees (default ubo81)"
+        "ubo81, ubo151, a grid such as 10x5, or a .txt file of theta and phi in degrees (default %(default)s)"
     )
-    parser.add_argument("--views", default="ubo81", metavar="SET", help=directions)
-    parser.add_argument("--lights", default="ubo81", metavar="SET", help="likewise")
+    parser.add_argument("--views", default=default.views, metavar="SET", help=directions)
+    parser.add_argument("--lights", default=default.lights, metavar="SET", help="likewise")
     parser.add_argument(
         "--spp",
         type=count(2),
+        default=default.spp,
         metavar="N",
-        help="paths (or surface points) per texel and view (default 64); with --target-error the most that a "
-        "texel gets (default 4096)",
+        help=f"paths (or surface points) per texel and view (default {SAMPLES}); with --target-error the most "
+        f"that a texel gets (default {MOST_SAMPLES})",
     )
     parser.add_argument(
         "--target-error",
@@ -73,19 +80,23 @@ def add_arguments(parser):
         metavar="E",
         help="and for this one at most of every texel of a view (default: no limit)",
     )
-    parser.add_argument("--max-depth", type=count(2), default=8, metavar="N", help="as Mitsuba's (default 8)")
-    parser.add_argument("--seed", type=count(0), default=0, metavar="N")
     parser.add_argument(
-        "--dtype", choices=("float16", "float32"), default="float16", help="of the stored values"
+        "--max-depth",
+        type=count(2),
+        default=default.max_depth,
+        metavar="N",
+        help="as Mitsuba's (default %(default)s)",
     )
+    parser.add_argument("--seed", type=count(0), default=default.seed, metavar="N")
+    parser.add_argument("--dtype", choices=DTYPES, default=default.dtype, help="of the stored values")
     parser.add_argument(
         "--set", nargs="+", action="extend", metavar="KEY=VALUE", help="parameters of the mesostructure"
     )
     parser.add_argument(
         "--estimator",
-        choices=("path", "surface"),
-        default="path",
-        help="path: the reference; surface: visibility traced once for all views and lights (default path)",
+        choices=tuple(ESTIMATORS),
+        default=default.estimator,
+        help="path: the reference; surface: visibility traced once for all views and lights (default %(default)s)",
     )
     parser.add_argument(
         "--no-variance",
@@ -142,7 +153,7 @@ def add_arguments(parser):
         "--workers", type=count(1), metavar="N", help="of the local cluster (default: one per two processors)"
     )
     parser.add_argument(
-        "--variant", default="llvm_ad_rgb", help="of Mitsuba (default llvm_ad_rgb; cuda_ad_rgb)"
+        "--variant", default=default.variant, help="of Mitsuba (default %(default)s; cuda_ad_rgb)"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace a store of other settings")
     parser.add_argument("--json", action="store_true", help="print the facts of the store as JSON")
@@ -155,28 +166,20 @@ def run(args):
     for name in _OWN:
         if getattr(args, name) is not None:
             parameters[name] = getattr(args, name)
-    settings = {
-        "texels": args.texels,
-        "views": direction_set(args.views),
-        "lights": direction_set(args.lights),
-        "spp": args.spp,
-        "seed": args.seed,
-        "max_depth": args.max_depth,
-        "dtype": args.dtype,
-        "estimator": args.estimator,
-        "target_error": args.target_error,
-        "texel_error": args.texel_error,
-        "variance": not args.no_variance,
-        "variant": args.variant,
-    }
     for key in parameters:
-        if key in settings:
+        if key in SynthesisSettings.names():
             option = f"--{key.replace('_', '-')}"
             raise InputError("not a parameter of the mesostructure", field="--set", got=key, expected=option)
 
     from btfref.sampling.store.selection import Selection
     from btfref.sampling.synthesis import synthesize_store
 
+    chosen = vars(args) | {
+        "views": direction_set(args.views),
+        "lights": direction_set(args.lights),
+        "variance": not args.no_variance,
+    }
+    settings = SynthesisSettings(**{name: chosen[name] for name in SynthesisSettings.names()})
     only = Selection(args.only_views, args.only_lights, args.only_tiles)
     if args.scenes:
         if only != Selection():
@@ -191,6 +194,7 @@ def run(args):
         store = synthesize_store(
             out,
             args.mesostructure,
+            settings,
             overwrite=args.overwrite,
             progress=progress,
             only=only,
@@ -198,7 +202,6 @@ def run(args):
             scheduler=args.scheduler,
             workers=args.workers,
             report=peak.append,
-            **settings,
             **parameters,
         )
     info = store.info() | {"peak_memory_bytes": peak[0]}

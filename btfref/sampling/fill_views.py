@@ -46,23 +46,23 @@ def fill_views(job, store, views, *, stage, only=None, plan=None, memory, done=N
     shard = tuple(a * b for a, b in zip(store.shard, store.tile, strict=True))
     size = blocks(
         memory,
-        estimator=job.estimator,
+        estimator=job.settings.estimator,
         triangles=sum(len(part.faces) for part in job.mesostructure.parts),
         n_views=len(views),
         n_lights=len(job.lights),
         texels=job.texels,
         shard=shard,
-        spp=job.spp if job.target_error is None else adaptive.SURFACE_POINTS,
+        spp=job.settings.samples if job.settings.target_error is None else adaptive.SURFACE_POINTS,
         # Means over all lights decide how many passes there are: they are made at once.
-        split_lights=job.target_error is None,
+        split_lights=job.settings.target_error is None,
     )
     work = {
         ("path", "pilot"): _pilot_by_texels,
         ("path", "synthesis"): _fill_by_texels,
         ("surface", "pilot"): _pilot_by_views,
         ("surface", "synthesis"): _fill_by_views if plan is None else _fill_by_passes,
-    }[job.estimator, stage]
-    with mitsuba_variant(job.variant):
+    }[job.settings.estimator, stage]
+    with mitsuba_variant(job.settings.variant):
         for view in work(job, store, views, only or Selection(), plan, size):
             if done is not None:
                 done(view)

@@ -2,141 +2,107 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import importlib
 import json
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.mesostructure import build
 from btfref.mesostructure.materials import load_bsdf
-from btfref.numerics.sphere.directions import directions
-from btfref.provenance import versions
+from btfref.provenance import LLVM, versions
 from btfref.sampling.fallback import reason_against_surface
 from btfref.sampling.paths import adaptive
-from btfref.sampling.paths.texels import STREAMS
 from btfref.sampling.scheduling import run
-from btfref.sampling.store.layout import TILE, remove_leftovers
+from btfref.sampling.settings import ESTIMATORS, SynthesisSettings
+from btfref.sampling.store.layout import remove_leftovers
 from btfref.sampling.store.resume import resumable
 from btfref.sampling.store.selection import Selection
 from btfref.sampling.store.store import create_store
 from btfref.sampling.variant import mitsuba_variant
 
-#: name -> "module:class". An estimator is made from (mesostructure, light vectors, all view vectors, texels,
-#: spp, seed, max_depth, wanted views, mask of texels); ``all_views(views)`` yields (view, mean, variance of
-#: the mean), arrays (lights, rows, columns, 3) float32. Any order and any subset gives the same bytes.
-ESTIMATORS = {
-    "path": "btfref.sampling.paths.texels:TexelPaths",
-    "surface": "btfref.sampling.surface.estimator:SurfaceEstimator",
-}
+if TYPE_CHECKING:
+    from btfref.mesostructure import Mesostructure
+    from btfref.sampling.store.store import BTFStore
+    from btfref.types import Facts, PathLike, Progress
 
-#: What a result depends on; recorded with it.
+#: What a result depends on; recorded with it, and LLVM where it compiles the kernels.
 VERSIONS = ("numpy", "mitsuba", "drjit")
-
-_LARGEST = {"texels": 4096, "spp": 1 << 20}
 
 
 class Job:
-    """Checked settings of one synthesis; parameters as of `synthesize`."""
+    """One synthesis, checked: nothing of it can fail for a setting once the store is there.
+
+    Parameters
+    ----------
+    mesostructure : str, path-like or Mesostructure
+    parameters : dict
+        Of the mesostructure.
+    settings : SynthesisSettings
+
+    Attributes
+    ----------
+    settings : SynthesisSettings
+        Those asked for, but for the estimator where "path" takes the place of "surface".
+    mesostructure : Mesostructure
+    views, lights : DirectionSet
+    texels : (int, int)
+        Rows and columns.
+    attributes : dict
+        Of the store.
+
+    Raises
+    ------
+    InputError
+        A variant or a mesostructure that cannot be used.
+    """
 
     def __init__(
-        self,
-        mesostructure,
-        parameters,
-        texels,
-        views,
-        lights,
-        spp,
-        seed,
-        max_depth,
-        dtype,
-        estimator,
-        variant,
-        target_error,
-        texel_error,
-        variance=True,
-    ):
-        sides = texels if np.ndim(texels) else (texels, texels)
-        if len(sides) != 2:
-            raise InputError(
-                "texels of the tile", field="texels", got=texels, expected="n or (rows, columns)"
-            )
-        self.texels = tuple(_whole("texels", side, 1, _LARGEST["texels"]) for side in sides)
-        self.target_error = _share("target_error", target_error)
-        self.texel_error = _share("texel_error", texel_error)
-        if self.target_error is None and texel_error is not None:
-            raise InputError("without a target error", field="texel_error", got=texel_error, expected="both")
-        self.variance = bool(variance)
-        if self.target_error is not None and not self.variance:
-            raise InputError(
-                "a target error wants variances", field="variance", got=variance, expected="True"
-            )
-        least = 2 if target_error is None else adaptive.LEAST
-        most = _LARGEST["spp"] if target_error is None else STREAMS
-        spp = (64 if target_error is None else 4096) if spp is None else spp
-        self.spp = _whole("spp", spp, least, most)
-        self.seed = _whole("seed", seed, 0, 2**63 - 1)
-        self.max_depth = -1 if max_depth == -1 else _whole("max_depth", max_depth, 2, 10_000)
-        if dtype not in ("float16", "float32"):
-            raise InputError(
-                "type of the values", field="dtype", got=repr(dtype), expected="float16 or float32"
-            )
-        if estimator not in ESTIMATORS:
-            raise InputError(
-                "unknown estimator",
-                field="estimator",
-                got=repr(estimator),
-                expected=f"one of {', '.join(ESTIMATORS)}",
-            )
-        self.dtype, self.estimator, self.variant = dtype, estimator, variant
-        # Every setting is tried before anything is written.
-        with mitsuba_variant(variant):
+        self, mesostructure: PathLike | Mesostructure, parameters: Facts, settings: SynthesisSettings
+    ) -> None:
+        self.views, self.lights, self.texels = settings.view_set, settings.light_set, settings.sides
+        with mitsuba_variant(settings.variant):
             pass
-        self.views, self.lights = directions(views), directions(lights)
         self.mesostructure = build(mesostructure, **parameters)
-        with mitsuba_variant(variant):
+        with mitsuba_variant(settings.variant):
             bsdfs = [load_bsdf(part) for part in self.mesostructure.parts]
-            fallback = reason_against_surface(bsdfs) if estimator == "surface" else None
+            fallback = reason_against_surface(bsdfs) if settings.estimator == "surface" else None
         if fallback is not None:
-            estimator = self.estimator = "path"
+            settings = dataclasses.replace(settings, estimator="path")
+        self.settings = settings
         self.attributes = {
-            "seed": self.seed,
-            "estimator": estimator,
-            "parameters": {
-                "texels": list(self.texels),
-                "spp": self.spp,
-                "max_depth": self.max_depth,
-                "dtype": dtype,
-                "variant": variant,
-                "tile": TILE,
-            },
+            **settings.attributes(),
             "parent": {
                 "kind": "mesostructure",
                 "name": self.mesostructure.name,
                 "parameters": self.mesostructure.parameters,
                 "geometry": fingerprint(self.mesostructure),
             },
-            "versions": versions(VERSIONS),
+            "versions": versions((*VERSIONS, LLVM) if settings.variant.startswith("llvm") else VERSIONS),
         }
-        if not self.variance:
-            self.attributes["parameters"]["variance"] = False
         if fallback is not None:
             self.attributes["fallback"] = f"path instead of surface: {fallback}"
-        if self.target_error is not None:
-            self.attributes["parameters"] |= {
-                "target_error": self.target_error,
-                "texel_error": self.texel_error,
-                "pilot": adaptive.PILOT if estimator == "path" else adaptive.SURFACE_POINTS,
-            }
 
-    def make_estimator(self, wanted, *, lights=None, mask=None, spp=None, stream=None, buffer=None):
-        """The estimator of some views; make and use it inside a `mitsuba_variant` block.
+    def make_estimator(
+        self,
+        wanted: Iterable[int],
+        *,
+        lights: np.ndarray | None = None,
+        mask: np.ndarray | None = None,
+        spp: int | None = None,
+        stream: tuple[int, ...] | None = None,
+        buffer: int | None = None,
+    ) -> Any:
+        """The estimator of some views, of a class of `ESTIMATORS`; make and use it inside a `mitsuba_variant` block.
 
         Parameters
         ----------
-        wanted : sequence of int
+        wanted : iterable of int
             Views.
         lights : ndarray of int, optional
             That the surface estimator makes; all when not given. That of paths is told from view to view.
@@ -149,11 +115,18 @@ class Job:
         buffer : int, optional
             Bytes of the sample buffer, where the estimator has one.
         """
-        module, _, name = ESTIMATORS[self.estimator].partition(":")
+        settings = self.settings
+        options: dict[str, Any] = {}
+        module, _, name = ESTIMATORS[settings.estimator].partition(":")
         make = getattr(importlib.import_module(module), name)
-        seed = self.seed
+        seed = settings.seed
         if stream is not None:
             seed = int(np.random.SeedSequence([seed, *stream]).generate_state(1, np.uint64)[0] >> 2)
+        if buffer is not None:
+            options["buffer"] = buffer
+        if settings.estimator == "surface":
+            # Paths make their variance in passing; it is not kept.
+            options |= {"variance": settings.variance, "chosen": lights}
         return make(
             self.mesostructure,
             self.lights.vectors,
@@ -161,15 +134,15 @@ class Job:
             wanted=[int(view) for view in wanted],
             mask=mask,
             texels=self.texels,
-            spp=self.spp if spp is None else spp,
+            spp=settings.samples if spp is None else spp,
             seed=seed,
-            max_depth=self.max_depth,
-            **({} if buffer is None else {"buffer": buffer}),
-            # Paths make theirs in passing; they are not kept.
-            **({"variance": self.variance, "chosen": lights} if self.estimator == "surface" else {}),
+            max_depth=settings.max_depth,
+            **options,
         )
 
-    def unfinished(self, store, views, stage, only=None):
+    def unfinished(
+        self, store: BTFStore, views: Iterable[int], stage: str, only: Selection | None = None
+    ) -> list[int]:
         """Those of some views that a stage has not made yet."""
         if stage == "pilot":
             pilots = store.maps("pilot")
@@ -179,9 +152,26 @@ class Job:
         covered = store.coverage[:, :, tiles[0], tiles[1]].all(-1)
         return [int(view) for view in views if (wanted[view] & ~covered[view]).any()]
 
-    def to_store(self, out, *, overwrite=False, progress=None, only=None, report=None, **means):
-        """Fill the store at ``out``, from where an earlier run of the same settings stopped."""
-        out = Path(out)
+    def to_store(
+        self,
+        out: PathLike,
+        *,
+        overwrite: bool = False,
+        progress: Progress | None = None,
+        only: Selection | None = None,
+        report: Callable[[int], object] | None = None,
+        **means: Any,
+    ) -> BTFStore:
+        """Fill the store at ``out``, from where an earlier run of the same settings stopped.
+
+        Parameters
+        ----------
+        out, overwrite, progress, only, report
+            As for `btfref.sampling.synthesis.synthesize_store`.
+        **means
+            ``memory``, ``scheduler`` and ``workers`` of `btfref.sampling.scheduling.run`.
+        """
+        out, settings = Path(out), self.settings
         remove_leftovers(out)
         store = None
         if out.exists() or out.is_symlink():
@@ -192,15 +182,15 @@ class Job:
                 views=self.views,
                 lights=self.lights,
                 texels=self.texels,
-                dtype=self.dtype,
-                variance=self.variance,
+                dtype=settings.dtype,
+                variance=settings.variance,
                 attributes=self.attributes,
-                adaptive=self.target_error is not None,
+                adaptive=settings.target_error is not None,
             )
         only = only or Selection()
         views, *_ = only.indices(store)
         peak, plan = 0, None
-        if self.target_error is not None:
+        if settings.target_error is not None:
             if not only.wanted(store)[views].all():
                 # Samples are placed for the mean over all lights, which share them.
                 raise InputError("with a target error all lights are made together", field="lights")
@@ -215,17 +205,16 @@ class Job:
             )
             plan = adaptive.make_plan(
                 lambda: (store.maps("pilot")[view] for view in every),
-                target=self.target_error,
-                texel_error=self.texel_error,
+                target=settings.target_error,
+                texel_error=settings.texel_error,
                 most=self._most(),
-                whole_views=self.estimator == "surface",
+                whole_views=settings.estimator == "surface",
             )
         missing = self.unfinished(store, views, "synthesis", only)
         done = len(views) - len(missing)
-        ahead = None
-        if progress is not None:
 
-            def ahead(now, total, label):
+        def ahead(now: int, total: int, label: str) -> None:
+            if progress is not None:
                 progress(done + now, done + total, label)
 
         used = run(self, store, missing, stage="synthesis", only=only, plan=plan, progress=ahead, **means)
@@ -234,33 +223,15 @@ class Job:
             report(max(peak, used))
         return store
 
-    def _most(self):
+    def _most(self) -> int:
         """Most samples of a texel, or passes of a view."""
+        most = self.settings.samples
         return (
-            max(1, self.spp // adaptive.SURFACE_POINTS) if self.estimator == "surface" else self.spp // 2 * 2
+            max(1, most // adaptive.SURFACE_POINTS) if self.settings.estimator == "surface" else most // 2 * 2
         )
 
 
-def _whole(name, value, low, high):
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= high:
-        raise InputError(
-            "setting of the synthesis", field=name, got=value, expected=f"a whole number in [{low}, {high}]"
-        )
-    return int(value)
-
-
-def _share(name, value):
-    """A relative error, or None."""
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 1e-5 <= value <= 10:
-        raise InputError(
-            "setting of the synthesis", field=name, got=value, expected="a number in [1e-5, 10], 0.02 for 2 %"
-        )
-    return float(value)
-
-
-def fingerprint(mesostructure):
+def fingerprint(mesostructure: Mesostructure) -> str:
     """What geometry, materials and textures come to: a user's files may change under their names.
 
     Parameters

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from pathlib import Path
+from typing import NoReturn
 
 from btfref.errors import InputError
 
@@ -52,13 +54,17 @@ class Blocks:
     lights: int
 
 
-def default_budget():
+def default_budget() -> int:
     """Half of the machine's memory, bytes."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
 
 
-def peak():
+def peak() -> int:
     """Largest amount of memory (bytes) that this process ever had in use."""
+    own = of_this_process("VmHWM")
+    if own is not None:
+        return own
+    # What other systems offer, with a flaw: a child starts with what its parent had when it was forked.
     import resource
     import sys
 
@@ -66,7 +72,39 @@ def peak():
     return used if sys.platform == "darwin" else used * 1024
 
 
-def blocks(budget, *, estimator, triangles, n_views, n_lights, texels, shard, spp, split_lights=True):
+def of_this_process(field: str) -> int | None:
+    """What the system says of this process's memory.
+
+    Parameters
+    ----------
+    field : str
+        Of ``/proc/self/status``: "VmRSS", what it has in use now; "VmHWM", the most since it began or since the
+        mark was reset.
+
+    Returns
+    -------
+    int or None
+        Bytes; None where the system does not tell.
+    """
+    try:
+        lines = Path("/proc/self/status").read_text("ascii", "replace").splitlines()
+    except OSError:
+        return None
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(f"{field}:")), None)
+
+
+def blocks(
+    budget: int,
+    *,
+    estimator: str,
+    triangles: int,
+    n_views: int,
+    n_lights: int,
+    texels: tuple[int, int],
+    shard: tuple[int, ...],
+    spp: int,
+    split_lights: bool = True,
+) -> Blocks:
     """Largest blocks within a budget; they have no influence on any result.
 
     Parameters
@@ -107,7 +145,7 @@ def blocks(budget, *, estimator, triangles, n_views, n_lights, texels, shard, sp
     free -= SURFACE_BASE
     points = spp * texels[0] * texels[1]
 
-    def need(views, lights):
+    def need(views: int, lights: int) -> int:
         values = 3 * lights * texels[0] * texels[1]
         return values * PER_VALUE + points * (PER_POINT + lights * PER_POINT_LIGHT + views * PER_POINT_VIEW)
 
@@ -119,10 +157,10 @@ def blocks(budget, *, estimator, triangles, n_views, n_lights, texels, shard, sp
                 return Blocks(BUFFER_RANGE[1], views, lights)
         if need(1, lights) <= free:
             return Blocks(BUFFER_RANGE[1], 1, lights)
-    return _refuse(budget, budget - free + need(1, lights))
+    _refuse(budget, budget - free + need(1, lights))
 
 
-def _refuse(budget, least):
+def _refuse(budget: int, least: int) -> NoReturn:
     raise InputError(
         "memory budget too small for these settings",
         field="memory",

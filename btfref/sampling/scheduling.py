@@ -138,7 +138,7 @@ def _distribute(client, job, store, views, stage, only, plan, settings, done):
     import distributed
 
     count = max(1, len(client.nthreads()))
-    if job.estimator == "surface":
+    if job.settings.estimator == "surface":
         # Points and their walks serve all views of a task: as few tasks as there are workers.
         size = -(-len(views) // count)
     else:
@@ -208,7 +208,7 @@ def _use_threads(job, threads):
     """Tell Dr.Jit how many threads this worker may use."""
     from btfref.sampling.variant import mitsuba_variant
 
-    with mitsuba_variant(job.variant):
+    with mitsuba_variant(job.settings.variant):
         import drjit as dr
 
         if dr.thread_count() != threads:

@@ -28,6 +28,7 @@ def make_material(cache, mesostructure, settings, progress=None):
     list of pathlib.Path
         The stores.
     """
+    from btfref.sampling.settings import SynthesisSettings
     from btfref.sampling.synthesis import synthesize
 
     key, paths = material_key(mesostructure, settings), []
@@ -38,18 +39,15 @@ def make_material(cache, mesostructure, settings, progress=None):
             continue
         # A run that was killed leaves its parts under this name, and nothing under the other.
         partial = cache.path(key, f".{twin}.{os.getpid()}.btf.zarr")
-        synthesize(
-            mesostructure,
+        made = SynthesisSettings(
             texels=settings.texels,
             views=settings.directions,
             lights=settings.directions,
             spp=settings.spp,
             estimator=settings.estimator,
             seed=settings.seed + TWIN * twin,
-            out=partial,
-            overwrite=True,
-            progress=progress,
         )
+        synthesize(mesostructure, made, out=partial, overwrite=True, progress=progress)
         if path.exists():
             shutil.rmtree(partial)
         else:

@@ -16,7 +16,8 @@ def resumable(out, views, lights, attributes, overwrite):
         Exists.
     views, lights : DirectionSet
     attributes : dict
-        What the store must have been made with; "versions" counts only while it is incomplete.
+        What the store must have been made with; "versions" counts only while it is incomplete, and of it only
+        what the store says: earlier versions recorded less.
     overwrite : bool
         Remove a store of other settings, or a damaged one.
 
@@ -46,6 +47,9 @@ def resumable(out, views, lights, attributes, overwrite):
     if store.complete:
         # A finished result stays what it is when a library is updated; a half-done one must not be mixed.
         wanted.pop("versions")
+    else:
+        said = found.get("versions", {})
+        wanted["versions"] = {name: wanted["versions"].get(name) for name in said}
     for key, value in wanted.items():
         if found.get(key) == value:
             continue
