@@ -17,12 +17,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from btfref.precision import real
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 #: Version of the file schemas; readers refuse a newer one.
 SCHEMA_VERSION = 1

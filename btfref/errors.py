@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from btfref.types import PathLike
+
 
 class BtfrefError(Exception):
     """Base class of the errors that btfref raises on purpose."""
@@ -22,7 +27,15 @@ class InputError(BtfrefError, ValueError):
         The value found and the value (or set of values) wanted.
     """
 
-    def __init__(self, message, *, file=None, field=None, got=None, expected=None):
+    def __init__(
+        self,
+        message: str,
+        *,
+        file: PathLike | None = None,
+        field: str | None = None,
+        got: object = None,
+        expected: object = None,
+    ) -> None:
         self.message, self.file, self.field, self.got, self.expected = message, file, field, got, expected
         parts = [f"{file}: {message}" if file is not None else message]
         if field is not None:
@@ -45,6 +58,6 @@ class MissingDependencyError(BtfrefError):
         What to install or set.
     """
 
-    def __init__(self, what, mend):
+    def __init__(self, what: str, mend: str) -> None:
         self.what, self.mend = what, mend
         super().__init__(f"{what}; {mend}")

@@ -5,10 +5,15 @@ from __future__ import annotations
 import glob
 import os
 import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from btfref.errors import MissingDependencyError
+
+if TYPE_CHECKING:
+    from btfref.types import PathLike
 
 #: LLVM 14 to 16 abort the process under Dr.Jit 1.5 on AVX-512 machines ("Cannot select … fminimum").
 MINIMUM_LLVM = 17
@@ -43,7 +48,7 @@ class LLVMChoice:
     refused: tuple[tuple[int, str], ...]
 
 
-def llvm_version(path):
+def llvm_version(path: PathLike) -> int | None:
     """Major version of an LLVM shared library, read from its real file name.
 
     Parameters
@@ -58,9 +63,9 @@ def llvm_version(path):
     return int(match.group(1)) if match else None
 
 
-def find_llvm(patterns=_SEARCH):
+def find_llvm(patterns: Iterable[str] = _SEARCH) -> list[tuple[int, str]]:
     """All LLVM libraries on this machine as ``(major version, path)``, newest first."""
-    found = {}
+    found: dict[str, tuple[int, str]] = {}
     for pattern in patterns:
         for path in sorted(glob.glob(pattern)):
             version = llvm_version(path)
@@ -69,7 +74,9 @@ def find_llvm(patterns=_SEARCH):
     return sorted(found.values(), reverse=True)
 
 
-def choose_llvm(environment=None, found=None):
+def choose_llvm(
+    environment: Mapping[str, str] | None = None, found: Sequence[tuple[int, str]] | None = None
+) -> LLVMChoice:
     """Decide which LLVM library Dr.Jit is to load; loads nothing itself.
 
     Parameters
@@ -102,7 +109,7 @@ def choose_llvm(environment=None, found=None):
     return LLVMChoice(None, None, f"{passed_over}none found of version {MINIMUM_LLVM} or later", refused)
 
 
-def prepare_llvm():
+def prepare_llvm() -> str:
     """Point Dr.Jit at an LLVM library that works; call before Dr.Jit loads one.
 
     Returns
@@ -127,7 +134,7 @@ def prepare_llvm():
     return choice.path
 
 
-def shader_directory():
+def shader_directory() -> Path:
     """Directory of the GLSL library: ``shaders/`` of a checkout, else the copy inside the installed package.
 
     Returns

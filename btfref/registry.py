@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -9,9 +10,13 @@ from importlib.metadata import entry_points
 from importlib.util import find_spec
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 from btfref.errors import InputError
+
+if TYPE_CHECKING:
+    from btfref.types import Facts, PathLike
 
 #: Third parties add rows with entry points of this group; each names an object of type :class:`Method`.
 ENTRY_POINT_GROUP = "btfref.representations"
@@ -57,22 +62,22 @@ class Method:
     editing: str = ""
 
     @property
-    def representation(self):
+    def representation(self) -> type[Any]:
         """The class that holds the method's maps and evaluates them in float64."""
         return import_module(self.module).Representation
 
     @property
-    def fitting(self):
+    def fitting(self) -> ModuleType:
         """The module that makes representations: a :class:`btfref.representations.protocol.FitModule`."""
         return import_module(self.fit_module or self.module)
 
     @property
-    def fit(self):
+    def fit(self) -> Callable[..., Any]:
         """``fit(btf, *, seed=0, progress=None, **params) -> Representation``."""
         return self.fitting.fit
 
     @property
-    def presets(self):
+    def presets(self) -> dict[str, Facts]:
         """Named settings of ``fit``; "paper" has the settings of the method's paper."""
         return self.fitting.PRESETS
 
@@ -120,12 +125,22 @@ class Method:
         return (self.presets[preset] if preset is not None else {}) | given
 
     @property
-    def editor(self):
+    def editor(self) -> ModuleType:
         """The module that writes maps as pictures for editing and reads them back."""
         return import_module(self.editing)
 
 
-def _row(key, title, paper, module, *, ports=None, image_light=None, fit=None, editing=None):
+def _row(
+    key: str,
+    title: str,
+    paper: str,
+    module: str,
+    *,
+    ports: str | None = None,
+    image_light: str | None = None,
+    fit: str | None = None,
+    editing: str | None = None,
+) -> Method:
     """A row of btfref's own; ``ports`` names the method whose ports evaluate the same maps."""
     return Method(
         key,
@@ -194,7 +209,7 @@ _ROWS = (
 
 
 @cache
-def methods():
+def methods() -> dict[str, Method]:
     """All methods by key, those of installed third-party packages included.
 
     Returns
@@ -217,7 +232,7 @@ def methods():
     return rows
 
 
-def method(key, *, file=None):
+def method(key: str, *, file: PathLike | None = None) -> Method:
     """The method ``key``.
 
     Raises
@@ -231,7 +246,7 @@ def method(key, *, file=None):
     return rows[key]
 
 
-def image_light(key, *, file=None):
+def image_light(key: str, *, file: PathLike | None = None) -> type[Any]:
     """The class of a method's prefiltered path for environments.
 
     Raises

@@ -11,7 +11,7 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from btfref.errors import MissingDependencyError
@@ -43,7 +43,7 @@ class Requirement:
     for_tests: bool = False
 
 
-def _loads(library):
+def _loads(library: str) -> bool:
     """Whether the dynamic loader finds a shared library."""
     try:
         ctypes.CDLL(library)
@@ -52,7 +52,7 @@ def _loads(library):
     return True
 
 
-def _has_gl_driver():
+def _has_gl_driver() -> bool:
     """Whether Mesa's DRI driver or NVIDIA's EGL library is there; libEGL itself is only a dispatcher."""
     patterns = (
         "/usr/lib/*/dri/*_dri.so",
@@ -63,7 +63,7 @@ def _has_gl_driver():
     return any(glob.glob(pattern) for pattern in patterns)
 
 
-def chromium():
+def chromium() -> str | None:
     """Path of a Chromium or Chrome that can run headless, or None."""
     names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
     return next((path for path in map(shutil.which, names) if path), None)
@@ -88,7 +88,7 @@ REQUIREMENTS = (
 )
 
 
-def missing(tests=False):
+def missing(tests: bool = False) -> list[Requirement]:
     """Requirements that this machine does not meet.
 
     Parameters
@@ -107,7 +107,7 @@ def missing(tests=False):
     ]
 
 
-def llvm_package(listing):
+def llvm_package(listing: str) -> str | None:
     """LLVM package to install, given the output of ``apt-cache pkgnames libllvm``.
 
     Version 19, which the tests run with, if offered; else the newest; None when no version is usable.
@@ -121,7 +121,7 @@ def llvm_package(listing):
     return name if name in names else f"{name}t64"
 
 
-def packages(requirements, listing=""):
+def packages(requirements: Iterable[Requirement], listing: str = "") -> list[str]:
     """Packages that bring `requirements`, each once; `listing` is apt's list of ``libllvm…`` packages."""
     names = []
     for requirement in requirements:
@@ -133,12 +133,14 @@ def packages(requirements, listing=""):
     return names
 
 
-def mend_command(requirements):
+def mend_command(requirements: Iterable[Requirement]) -> str:
     """The shell line that brings `requirements` on Debian or Ubuntu."""
     return "sudo apt-get install -y --no-install-recommends " + " ".join(packages(requirements))
 
 
-def install(requirements, run=subprocess.run):
+def install(
+    requirements: Sequence[Requirement], run: Callable[..., subprocess.CompletedProcess] = subprocess.run
+) -> list[str]:
     """Bring `requirements` with apt, as root or through sudo.
 
     Parameters

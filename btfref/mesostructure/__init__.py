@@ -11,11 +11,16 @@ from __future__ import annotations
 
 import importlib
 import inspect
+from collections.abc import Callable
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from btfref.errors import InputError
 from btfref.mesostructure.base import Mesostructure, Part
+
+if TYPE_CHECKING:
+    from btfref.types import PathLike
 
 __all__ = ["MESOSTRUCTURES", "Mesostructure", "Part", "build", "names"]
 
@@ -38,7 +43,7 @@ FROM_FILES = {
 ENTRY_POINT_GROUP = "btfref.mesostructures"
 
 
-def names():
+def names() -> list[str]:
     """Names of all mesostructures, built in and from entry points, sorted.
 
     Returns
@@ -48,7 +53,7 @@ def names():
     return sorted({*MESOSTRUCTURES, *(point.name for point in entry_points(group=ENTRY_POINT_GROUP))})
 
 
-def _builder(name):
+def _builder(name: str) -> Callable[..., Mesostructure]:
     if name in MESOSTRUCTURES:
         module, _, function = MESOSTRUCTURES[name].partition(":")
         return getattr(importlib.import_module(module), function)
@@ -63,7 +68,7 @@ def _builder(name):
     )
 
 
-def build(mesostructure, **parameters):
+def build(mesostructure: PathLike | Mesostructure, **parameters: Any) -> Mesostructure:
     """Geometry and materials of a mesostructure.
 
     Parameters
@@ -91,10 +96,11 @@ def build(mesostructure, **parameters):
                 expected="none",
             )
         return mesostructure
-    suffix = Path(str(mesostructure)).suffix.lower()
+    mesostructure = str(mesostructure)
+    suffix = Path(mesostructure).suffix.lower()
     for name, suffixes in FROM_FILES.items():
         if suffix in suffixes:
-            parameters = {"file": str(mesostructure), **parameters}
+            parameters = {"file": mesostructure, **parameters}
             mesostructure = name
     builder = _builder(mesostructure)
     known = inspect.signature(builder).parameters

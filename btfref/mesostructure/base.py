@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.errors import InputError
+
+if TYPE_CHECKING:
+    from btfref.types import Facts
 
 #: How far (tile units) the top may miss z = 0 and geometry may stick out of the tile: float32 rounding of 1.
 _SLACK = 1e-6
@@ -35,12 +39,12 @@ class Part:
 
     vertices: np.ndarray
     faces: np.ndarray
-    bsdf: dict
+    bsdf: Facts
     normals: np.ndarray | None = None
     uv: np.ndarray | None = None
-    textures: dict = field(default_factory=dict, repr=False)
+    textures: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
         faces = np.ascontiguousarray(self.faces, dtype=np.uint32)
         if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
@@ -51,6 +55,13 @@ class Part:
             )
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
+
+
+def square_below(z: float, bsdf: Facts) -> Part:
+    """The whole tile as a flat part at height ``z``, seen from above."""
+    square = np.array([[0, 0, z], [1, 0, z], [1, 1, z], [0, 1, z]], np.float64)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
+    return Part(square, faces, bsdf, normals=np.tile([0.0, 0.0, 1.0], (4, 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +77,10 @@ class Mesostructure:
     """
 
     name: str
-    parameters: dict = field(repr=False)
-    parts: tuple = field(repr=False)
+    parameters: Facts = field(repr=False)
+    parts: tuple[Part, ...] = field(repr=False)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         try:
             object.__setattr__(self, "parameters", json.loads(json.dumps(self.parameters)))
         except TypeError as error:
@@ -97,13 +108,13 @@ class Mesostructure:
             )
 
     @property
-    def height(self):
+    def height(self) -> tuple[float, float]:
         """Lowest and highest z, tile units: ``(low, high)`` with high = 0."""
         z = [part.vertices[np.unique(part.faces), 2] for part in self.parts]
         return float(min(values.min() for values in z)), float(max(values.max() for values in z))
 
     @property
-    def overhang(self):
+    def overhang(self) -> float:
         """How far (tile units, ≥ 0) the geometry sticks out of the unit tile on any side."""
         xy = np.concatenate([part.vertices[np.unique(part.faces), :2] for part in self.parts])
         return float(max(0.0, -xy.min(), xy.max() - 1.0))

@@ -6,14 +6,25 @@ functions* (Eurographics 2003); its dimensions are not given there, those here a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.mesostructure.base import Mesostructure, Part
-from btfref.mesostructure.checks import grid_faces
+from btfref.mesostructure.checks import colour as check_colour
+from btfref.mesostructure.checks import grid_faces, number
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from btfref.types import Facts
 
 
-def checker_height(x, y, *, cells, amplitude, smoothness):
+def checker_height(
+    x: ArrayLike, y: ArrayLike, *, cells: int, amplitude: float, smoothness: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Height of the checker and its slope, in tile units.
 
     ``h = A/2 · (tanh(g/s) / tanh(1/s) − 1)`` with ``g = sin(π c x) sin(π c y)``: a checker for s → 0, an egg
@@ -47,14 +58,7 @@ def checker_height(x, y, *, cells, amplitude, smoothness):
     return height, slope * cx * sy, slope * sx * cy
 
 
-def _check(name, value, low, high):
-    if not np.isfinite(value) or not low <= value <= high:
-        raise InputError(
-            "parameter of the checker", field=name, got=value, expected=f"a number in [{low}, {high}]"
-        )
-
-
-def _plastic(colour, roughness):
+def _plastic(colour: Sequence[float], roughness: float) -> Facts:
     return {
         "type": "roughplastic",
         "distribution": "ggx",
@@ -65,15 +69,15 @@ def _plastic(colour, roughness):
 
 def checker(
     *,
-    cells=2,
-    amplitude=0.15,
-    smoothness=0.35,
-    resolution=128,
-    raised_colour=(0.80, 0.25, 0.42),
-    low_colour=(0.06, 0.13, 0.48),
-    raised_roughness=0.1,
-    low_roughness=0.4,
-):
+    cells: int = 2,
+    amplitude: float = 0.15,
+    smoothness: float = 0.35,
+    resolution: int = 128,
+    raised_colour: Sequence[float] = (0.80, 0.25, 0.42),
+    low_colour: Sequence[float] = (0.06, 0.13, 0.48),
+    raised_roughness: float = 0.1,
+    low_roughness: float = 0.4,
+) -> Mesostructure:
     """The checker: pink, more specular squares rise above blue, rougher ones.
 
     The material changes at half height, in the middle of the slope, along straight lines x, y = i/cells.
@@ -113,16 +117,12 @@ def checker(
             got=resolution,
             expected=f"a multiple of {2 * int(cells)}, at most 2048",
         )
-    _check("amplitude", amplitude, 1e-6, 1.0)
-    _check("smoothness", smoothness, 0.05, 10.0)
+    number("the checker", "amplitude", amplitude, 1e-6, 1.0)
+    number("the checker", "smoothness", smoothness, 0.05, 10.0)
     for name, roughness in (("raised_roughness", raised_roughness), ("low_roughness", low_roughness)):
-        _check(name, roughness, 0.01, 1.0)
+        number("the checker", name, roughness, 0.01, 1.0)
     for name, colour in (("raised_colour", raised_colour), ("low_colour", low_colour)):
-        colour = np.asarray(colour, dtype=np.float64)
-        if colour.shape != (3,) or not ((colour >= 0) & (colour <= 1)).all():
-            raise InputError(
-                "parameter of the checker", field=name, got=colour, expected="3 values in [0, 1]"
-            )
+        check_colour("the checker", name, colour)
 
     n, cells = int(resolution), int(cells)
     line = np.arange(n + 1) / n
@@ -137,7 +137,7 @@ def checker(
     # Material borders are grid lines, so a quad's centre says which square all of it belongs to.
     raised = (column * cells // n + row * cells // n) % 2 == 0
 
-    def part(mask, bsdf):
+    def part(mask: np.ndarray, bsdf: Facts) -> Part:
         faces = np.concatenate([first[mask], second[mask]])
         used, faces = np.unique(faces, return_inverse=True)
         return Part(vertices[used], faces.reshape(-1, 3), bsdf, normals=normals[used])

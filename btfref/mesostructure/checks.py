@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from btfref.errors import InputError
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
-def number(owner, name, value, low, high):
+
+def number(owner: str, name: str, value: float, low: float, high: float) -> float:
     """A finite number within limits.
 
     Parameters
@@ -36,7 +41,7 @@ def number(owner, name, value, low, high):
     return float(value)
 
 
-def whole(owner, name, value, low, high, multiple=1):
+def whole(owner: str, name: str, value: float, low: int, high: int, multiple: int = 1) -> int:
     """A whole number within limits, a multiple of another; arguments and errors as of `number`.
 
     Returns
@@ -51,7 +56,7 @@ def whole(owner, name, value, low, high, multiple=1):
     return int(value)
 
 
-def colour(owner, name, value):
+def colour(owner: str, name: str, value: ArrayLike) -> list[float]:
     """Three reflectances in [0, 1], linear RGB; arguments and errors as of `number`.
 
     Returns
@@ -64,7 +69,7 @@ def colour(owner, name, value):
     return values.tolist()
 
 
-def sweep_faces(n_along, n_around):
+def sweep_faces(n_along: int, n_around: int) -> np.ndarray:
     """Triangles of a tube whose vertices are numbered ``along · n_around + around``; closed around only.
 
     Parameters
@@ -85,7 +90,7 @@ def sweep_faces(n_along, n_around):
     return np.concatenate([np.stack([here, ahead, across], 1), np.stack([here, across, beside], 1)])
 
 
-def grid_faces(rows, columns):
+def grid_faces(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
     """Triangles of a grid of quads whose vertices are numbered ``row · (columns + 1) + column``.
 
     The diagonals alternate: a fixed one would give slopes a handedness.

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.mesostructure.base import Mesostructure, Part
+from btfref.mesostructure.base import Mesostructure, square_below
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from btfref.types import Facts
 
 
-def flat(*, reflectance=0.5, bsdf=None):
+def flat(*, reflectance: ArrayLike = 0.5, bsdf: Facts | None = None) -> Mesostructure:
     """A plane at z = 0.
 
     Parameters
@@ -39,10 +46,7 @@ def flat(*, reflectance=0.5, bsdf=None):
             got=reflectance,
             expected="1 or 3 values in [0, 1]",
         )
-    rho = [float(value) for value in rho]
-    material = bsdf or {"type": "diffuse", "reflectance": {"type": "rgb", "value": rho}}
-    vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float64)
-    part = Part(
-        vertices, np.array([[0, 1, 2], [0, 2, 3]]), material, normals=np.tile([0.0, 0.0, 1.0], (4, 1))
-    )
-    return Mesostructure("flat", {"reflectance": rho, "bsdf": bsdf}, (part,))
+    colour = [float(value) for value in rho]
+    material = bsdf or {"type": "diffuse", "reflectance": {"type": "rgb", "value": colour}}
+    parameters = {"reflectance": colour, "bsdf": bsdf}
+    return Mesostructure("flat", parameters, (square_below(0.0, material),))

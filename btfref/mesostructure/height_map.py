@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,11 +20,24 @@ from btfref.mesostructure.materials import (
 )
 from btfref.mesostructure.seams import map_seams, refuse
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from btfref.types import Facts, PathLike
+
 #: Most pixels along one side: 2048² pixels are eight million triangles.
 LARGEST = 2048
 
 
-def height_map(*, file, amplitude=0.1, albedo=(0.5, 0.5, 0.5), roughness=None, bsdf=None, allow_seams=False):
+def height_map(
+    *,
+    file: PathLike,
+    amplitude: float = 0.1,
+    albedo: str | Sequence[float] = (0.5, 0.5, 0.5),
+    roughness: str | float | None = None,
+    bsdf: PathLike | None = None,
+    allow_seams: bool = False,
+) -> Mesostructure:
     """A surface whose heights are the pixels of an image, repeated without end.
 
     Pixel ``[row, column]`` is the height at v = (row + ½)/rows, u = (column + ½)/columns, as for texels. The
@@ -61,7 +76,7 @@ def height_map(*, file, amplitude=0.1, albedo=(0.5, 0.5, 0.5), roughness=None, b
         size = " x ".join(map(str, heights.shape))
         raise InputError("size of a height map", file=file, got=size, expected=f"2 to {LARGEST} a side")
     refuse(map_seams(heights[..., None], "heights"), file=file, allow=allow_seams)
-    textures = {}
+    textures: dict[str, np.ndarray] = {}
     if bsdf is not None:
         material, textures = bsdf_from_xml(bsdf)
     else:
@@ -78,7 +93,12 @@ def height_map(*, file, amplitude=0.1, albedo=(0.5, 0.5, 0.5), roughness=None, b
     return Mesostructure("height_map", parameters, (part,))
 
 
-def _material(albedo, roughness, textures, allow_seams):
+def _material(
+    albedo: str | Sequence[float],
+    roughness: str | float | None,
+    textures: dict[str, np.ndarray],
+    allow_seams: bool,
+) -> Facts:
     """Lambertian, or Mitsuba's ``principled``, with what is given as images in ``textures``."""
     colour = _map("albedo", albedo, textures, linear_colours, 3, allow_seams)
     if roughness is None:
@@ -91,7 +111,14 @@ def _material(albedo, roughness, textures, allow_seams):
     }
 
 
-def _map(name, value, textures, convert, n_channels, allow_seams):
+def _map(
+    name: str,
+    value: PathLike | ArrayLike,
+    textures: dict[str, np.ndarray],
+    convert: Callable[[np.ndarray], np.ndarray],
+    n_channels: int,
+    allow_seams: bool,
+) -> Facts | float:
     """A parameter of the BSDF: an image's texture, a colour or a number, in [0, 1]."""
     if isinstance(value, str | Path):
         image = convert(read_image(value, field=name))[..., :n_channels].astype(np.float32)
@@ -110,7 +137,7 @@ def _map(name, value, textures, convert, n_channels, allow_seams):
     return {"type": "rgb", "value": values.tolist()}
 
 
-def _surface(heights, material, textures):
+def _surface(heights: np.ndarray, material: Facts, textures: dict[str, np.ndarray]) -> Part:
     """The part through pixel centres and on to the next tile's first ones."""
     rows, columns = heights.shape
     row, column = (index.ravel() for index in np.mgrid[0 : rows + 1, 0 : columns + 1])

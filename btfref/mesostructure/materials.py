@@ -7,17 +7,24 @@ the part, and ``{"type": "transform", "matrix": rows}`` for a transformation.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from btfref.errors import InputError
 
+if TYPE_CHECKING:
+    from btfref.mesostructure.base import Part
+    from btfref.types import Facts, JitArray, PathLike
+
 #: Images that are read by way of Pillow.
 _IMAGES = (".png", ".jpg", ".jpeg", ".tga", ".bmp")
 
 
-def load_bsdf(part):
+def load_bsdf(part: Part) -> JitArray:
     """The Mitsuba BSDF of a part; set a variant first.
 
     Parameters
@@ -43,7 +50,7 @@ def load_bsdf(part):
         raise InputError("material that Mitsuba refuses", field="bsdf", got=reason) from error
 
 
-def _ready(value, textures, mi):
+def _ready(value: Any, textures: dict[str, np.ndarray], mi: ModuleType) -> Any:
     """A BSDF's dict with its arrays and transformations as Mitsuba takes them."""
     if not isinstance(value, dict):
         return value
@@ -58,7 +65,7 @@ def _ready(value, textures, mi):
     return result
 
 
-def read_image(path, *, field="file"):
+def read_image(path: PathLike, *, field: str = "file") -> np.ndarray:
     """An image as an array, row 0 first.
 
     Parameters
@@ -89,7 +96,7 @@ def read_image(path, *, field="file"):
     return np.ascontiguousarray(image)
 
 
-def _read_exr(path, field):
+def _read_exr(path: Path, field: str) -> np.ndarray:
     import OpenEXR
 
     try:
@@ -104,7 +111,7 @@ def _read_exr(path, field):
     return next(iter(channels.values()))
 
 
-def _read_pillow(path, field):
+def _read_pillow(path: Path, field: str) -> np.ndarray:
     from PIL import Image, UnidentifiedImageError
 
     if path.suffix.lower() not in _IMAGES:
@@ -113,23 +120,22 @@ def _read_pillow(path, field):
         )
     try:
         with Image.open(path) as image:
-            if image.mode in ("P", "1", "LA", "PA", "CMYK"):
-                image = image.convert("RGB" if image.mode in ("P", "CMYK") else "L")
-            array = np.asarray(image)
+            plain = {"P": "RGB", "CMYK": "RGB", "1": "L", "LA": "L", "PA": "L"}
+            array = np.asarray(image.convert(plain[image.mode]) if image.mode in plain else image)
     except (UnidentifiedImageError, OSError, SyntaxError) as error:
         raise InputError("cannot read the image", file=path, field=field, got=error) from None
     # Pillow hands 16-bit grey out as 32-bit whole numbers in some versions.
     return array.astype(np.uint16) if array.dtype == np.int32 else array
 
 
-def as_numbers(image):
+def as_numbers(image: np.ndarray) -> np.ndarray:
     """Values of an image as float64: whole numbers as shares of their range, floats as they are."""
     if image.dtype.kind == "f":
         return image.astype(np.float64)
     return image / float(np.iinfo(image.dtype).max)
 
 
-def linear_colours(image):
+def linear_colours(image: np.ndarray) -> np.ndarray:
     """Colours of an image, linear RGB float32 (rows, columns, 3): 8- and 16-bit images hold sRGB."""
     from btfref.numerics.colour import decode_srgb
 
@@ -137,12 +143,12 @@ def linear_colours(image):
     return np.broadcast_to(values, (*values.shape[:2], 3)).astype(np.float32)
 
 
-def texture(name):
+def texture(name: str) -> Facts:
     """A texture of plain numbers (linear colours) for a BSDF's dict; the array is the part's."""
     return {"type": "bitmap", "array": name, "raw": True, "format": "variant"}
 
 
-def bsdf_from_xml(path):
+def bsdf_from_xml(path: PathLike) -> tuple[Facts, dict[str, np.ndarray]]:
     """The BSDF of a Mitsuba XML file, with its textures.
 
     Parameters
@@ -182,7 +188,7 @@ def bsdf_from_xml(path):
             mi.set_variant(previous)
 
 
-def _described(nodes, path, mi):
+def _described(nodes: Sequence[Any], path: Path, mi: ModuleType) -> tuple[Facts, dict[str, np.ndarray]]:
     materials = {k for k, node in enumerate(nodes) if str(node.type) == "ObjectType.BSDF"}
     inner = {index for k in materials for index in _references(nodes[k].props)}
     outer = sorted(materials - inner)
@@ -190,15 +196,17 @@ def _described(nodes, path, mi):
         raise InputError(
             "materials in the file", file=path, field="bsdf", got=len(outer), expected="one <bsdf>"
         )
-    textures = {}
+    textures: dict[str, np.ndarray] = {}
     return _node(nodes, outer[0], path, textures, mi), textures
 
 
-def _references(props):
+def _references(props: Any) -> list[int]:
     return [props[key].index() for key in props.keys() if type(props[key]).__name__ == "ResolvedReference"]
 
 
-def _node(nodes, index, path, textures, mi):
+def _node(
+    nodes: Sequence[Any], index: int, path: Path, textures: dict[str, np.ndarray], mi: ModuleType
+) -> Facts:
     """One plugin of a parsed file as a dict of JSON types; images and data files become textures."""
     props = nodes[index].props
     result = {"type": props.plugin_name()}
@@ -222,7 +230,7 @@ def _node(nodes, index, path, textures, mi):
     return result
 
 
-def _take_file(plugin, path, textures):
+def _take_file(plugin: Facts, path: Path, textures: dict[str, np.ndarray]) -> None:
     """Read a plugin's file, looked up beside the XML file first, as Mitsuba does."""
     name = plugin["filename"]
     found = next((p for p in (path.parent / name, Path(name)) if p.is_file()), None)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -12,13 +14,31 @@ from btfref.mesostructure.base import Mesostructure, Part
 from btfref.mesostructure.materials import bsdf_from_xml, linear_colours, texture
 from btfref.mesostructure.seams import bounds_seams, mesh_seams, refuse
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+    from PIL.Image import Image
+    from trimesh.visual.material import PBRMaterial, SimpleMaterial
+
+    from btfref.types import Facts, PathLike
+
 #: Formats whose y axis points up by definition (glTF 2.0, sec. 3.4), and those whose texture coordinates count
 #: rows from the bottom when trimesh hands them out.
 _Y_UP = (".glb", ".gltf")
 _V_UP = (".obj", ".glb", ".gltf")
 
 
-def mesh(*, file, bsdf=None, tile=(0.0, 0.0, 1.0, 1.0), up=None, allow_seams=False):
+#: Vertices, faces, normals, texture coordinates, trimesh's visual.
+_Piece: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None, Any]
+
+
+def mesh(
+    *,
+    file: PathLike,
+    bsdf: PathLike | None = None,
+    tile: str | Sequence[float] = (0.0, 0.0, 1.0, 1.0),
+    up: str | None = None,
+    allow_seams: bool = False,
+) -> Mesostructure:
     """Triangles from a file, one square of which is the tile; its highest point touches the sampling plane.
 
     Parameters
@@ -81,7 +101,7 @@ def mesh(*, file, bsdf=None, tile=(0.0, 0.0, 1.0, 1.0), up=None, allow_seams=Fal
     return Mesostructure("mesh", parameters, tuple(parts))
 
 
-def _read(path):
+def _read(path: Path) -> list[_Piece]:
     """Pieces of a file as (vertices, faces, normals or None, uv or None, trimesh's visual)."""
     import trimesh
 
@@ -91,7 +111,8 @@ def _read(path):
         expected = f"one of {', '.join(FROM_FILES['mesh'])}"
         raise InputError("kind of mesh", file=path, field="file", expected=expected)
     try:
-        meshes = trimesh.load_scene(path, process=False).dump()
+        # Attributes of a piece depend on its kind, which trimesh does not state: points have no faces.
+        meshes: list[Any] = trimesh.load_scene(path, process=False).dump()
     except Exception as error:  # every format has exceptions of its own
         raise InputError("cannot read the mesh", file=path, field="file", got=error) from None
     pieces = []
@@ -116,7 +137,7 @@ def _read(path):
     return pieces
 
 
-def _square(tile, pieces, path):
+def _square(tile: str | Sequence[float], pieces: list[_Piece], path: Path) -> tuple[np.ndarray, float]:
     """Corner of the tile in the file's units, (3,), and its side."""
     used = np.concatenate([v[np.unique(f), :2] for v, f, *_ in pieces])
     if isinstance(tile, str):
@@ -135,12 +156,12 @@ def _square(tile, pieces, path):
     return np.append(corners[0], 0.0), float(side.max())
 
 
-def _own_material(visual, path):
+def _own_material(visual: Any, path: Path) -> tuple[Facts, dict[str, np.ndarray]]:
     """BSDF and textures of a piece's material."""
     from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
     material = getattr(visual, "material", None)
-    textures = {}
+    textures: dict[str, np.ndarray] = {}
     if isinstance(material, PBRMaterial):
         inner = _metallic_roughness(material, textures, path)
     elif isinstance(material, SimpleMaterial):
@@ -155,7 +176,7 @@ def _own_material(visual, path):
     return {"type": "twosided", "bsdf": inner}, textures
 
 
-def _image(image, path, what):
+def _image(image: Image, path: Path, what: str) -> np.ndarray:
     """A texture of a mesh as uint8 (rows, columns, 3)."""
     if image.mode in ("RGBA", "LA", "PA") and np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
         raise InputError(
@@ -164,7 +185,7 @@ def _image(image, path, what):
     return np.asarray(image.convert("RGB"))
 
 
-def _factor(value, default):
+def _factor(value: ArrayLike | None, default: float) -> np.ndarray:
     """A factor of a material as three floats; trimesh keeps colours as bytes."""
     if value is None:
         return np.full(3, default)
@@ -173,7 +194,9 @@ def _factor(value, default):
     return value[:3].astype(np.float64) / scale
 
 
-def _coloured(image, factor, name, textures, path):
+def _coloured(
+    image: Image | None, factor: np.ndarray, name: str, textures: dict[str, np.ndarray], path: Path
+) -> Facts:
     """Colour of a material: linear factor times sRGB image."""
     if image is None:
         return {"type": "rgb", "value": [float(value) for value in factor]}
@@ -182,7 +205,7 @@ def _coloured(image, factor, name, textures, path):
     return texture(name)
 
 
-def _metallic_roughness(material, textures, path):
+def _metallic_roughness(material: PBRMaterial, textures: dict[str, np.ndarray], path: Path) -> Facts:
     """The metallic-roughness model of glTF 2.0 (sec. 3.9.2) as ``principled``; absent factors are 1."""
     result = {
         "type": "principled",
@@ -207,7 +230,7 @@ def _metallic_roughness(material, textures, path):
     return result
 
 
-def _wavefront(material, textures, path):
+def _wavefront(material: SimpleMaterial, textures: dict[str, np.ndarray], path: Path) -> Facts:
     """``Kd``, ``map_Kd``, ``Ks`` and ``Ns`` of a Wavefront material."""
     image, values = material.image, material.kwargs
     diffuse = _factor(values.get("kd"), 1.0 if image is not None else 0.5)

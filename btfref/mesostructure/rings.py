@@ -6,25 +6,27 @@ functions* (Eurographics 2003); their dimensions are not given there, those here
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.mesostructure.base import Mesostructure, Part
+from btfref.mesostructure.base import Mesostructure, Part, square_below
 from btfref.mesostructure.checks import colour, number, sweep_faces, whole
 
 
 def rings(
     *,
-    count=3,
-    thickness=0.09,
-    gap=0.004,
-    segments=144,
-    sides=32,
-    material="Au",
-    roughness=0.15,
-    base_colour=(0.05, 0.12, 0.5),
-    base_roughness=0.1,
-):
+    count: int = 3,
+    thickness: float = 0.09,
+    gap: float = 0.004,
+    segments: int = 144,
+    sides: int = 32,
+    material: str = "Au",
+    roughness: float = 0.15,
+    base_colour: Sequence[float] = (0.05, 0.12, 0.5),
+    base_roughness: float = 0.1,
+) -> Mesostructure:
     """Closed rings (tori) around the middle of the tile, evenly spaced, just above a plane.
 
     Parameters
@@ -86,11 +88,9 @@ def rings(
         "alpha": base_roughness,
         "diffuse_reflectance": {"type": "rgb", "value": base_colour},
     }
-    low = -thickness - gap
-    square = np.array([[0, 0, low], [1, 0, low], [1, 1, low], [0, 1, low]], np.float64)
     parts = (
         Part(np.concatenate(vertices), np.concatenate(faces), gold, normals=np.concatenate(normals)),
-        Part(square, [[0, 1, 2], [0, 2, 3]], blue, normals=np.tile([0.0, 0.0, 1.0], (4, 1))),
+        square_below(-thickness - gap, blue),
     )
     parameters = {
         "count": count,
@@ -106,7 +106,7 @@ def rings(
     return Mesostructure("rings", parameters, parts)
 
 
-def _torus(radius, wire, segments, sides):
+def _torus(radius: float, wire: float, segments: int, sides: int) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and normals of a ring that touches z = 0 from below, around the middle of the tile."""
     along = 2 * np.pi * np.arange(segments)[:, None] / segments
     around = 2 * np.pi * np.arange(sides)[None, :] / sides

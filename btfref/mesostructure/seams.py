@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.errors import InputError
+
+if TYPE_CHECKING:
+    from btfref.types import PathLike
 
 #: Largest gap (tile units) between borders that count as meeting: what five digits in a text file leave, and a
 #: hundredth of a texel at 1024².
@@ -36,7 +41,7 @@ class Seam:
     gap: float
 
 
-def refuse(seams, *, file, allow, field="file"):
+def refuse(seams: Sequence[Seam], *, file: PathLike, allow: bool, field: str = "file") -> None:
     """InputError for the worst of some seams, unless they are allowed."""
     if not seams or allow:
         return
@@ -49,7 +54,7 @@ def refuse(seams, *, file, allow, field="file"):
     )
 
 
-def open_edges(vertices, faces):
+def open_edges(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Edges that a mesh and its copies at all whole offsets leave open.
 
     Vertices are welded on the torus, whose points are x and y modulo 1; an edge is open when a single
@@ -87,7 +92,7 @@ def open_edges(vertices, faces):
     return np.stack([vertices[a[lonely]], vertices[b[lonely]]], 1)
 
 
-def _hashed(*columns):
+def _hashed(*columns: np.ndarray) -> np.ndarray:
     """One number per row of whole numbers: sorting these is ten times faster than sorting rows."""
     state = np.zeros(len(columns[0]), np.uint64)
     for column in columns:
@@ -96,7 +101,7 @@ def _hashed(*columns):
     return state
 
 
-def mesh_seams(vertices, faces):
+def mesh_seams(vertices: np.ndarray, faces: np.ndarray) -> list[Seam]:
     """Where a mesh on the unit tile does not meet its copies.
 
     Parameters
@@ -151,7 +156,7 @@ def mesh_seams(vertices, faces):
     return sorted(seams, key=lambda seam: -seam.gap)
 
 
-def _distance_to_copies(points, edges):
+def _distance_to_copies(points: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distance of points to the nearest border edge of the eight tiles around, and the place there."""
     offsets = np.array([[i, j, 0] for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j], np.float64)
     best = np.full(len(points), np.inf)
@@ -181,7 +186,7 @@ def _distance_to_copies(points, edges):
     return best, place
 
 
-def bounds_seams(low, high):
+def bounds_seams(low: np.ndarray, high: np.ndarray) -> list[Seam]:
     """Whether a mesh's bounds can be those of one unit tile.
 
     Parameters
@@ -207,7 +212,7 @@ def bounds_seams(low, high):
     return seams
 
 
-def map_seams(values, name):
+def map_seams(values: np.ndarray, name: str) -> list[Seam]:
     """Where a map's opposite borders do not continue each other.
 
     Parameters

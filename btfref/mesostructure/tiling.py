@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
 from btfref.mesostructure.materials import load_bsdf
 from btfref.numerics.device_arrays import to_device
 
+if TYPE_CHECKING:
+    from btfref.mesostructure.base import Mesostructure
+    from btfref.types import Facts, JitArray
 
-def tile_group(mesostructure, bsdfs=None):
+
+def tile_group(mesostructure: Mesostructure, bsdfs: Sequence[JitArray] | None = None) -> JitArray:
     """One tile as a Mitsuba shape group; set a JIT variant first.
 
     Parameters
@@ -46,7 +53,13 @@ def tile_group(mesostructure, bsdfs=None):
     return mi.load_dict(group)
 
 
-def tiled_shapes(mesostructure, columns, rows, to_world=None, bsdfs=None):
+def tiled_shapes(
+    mesostructure: Mesostructure,
+    columns: Iterable[int],
+    rows: Iterable[int],
+    to_world: JitArray | None = None,
+    bsdfs: Sequence[JitArray] | None = None,
+) -> Facts:
     """Copies of the tile as a dict of shapes for ``mi.load_dict``.
 
     Parameters

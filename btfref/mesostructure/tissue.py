@@ -6,11 +6,17 @@ functions* (Eurographics 2003); its dimensions are not given there, those here a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.mesostructure.base import Mesostructure, Part
+from btfref.mesostructure.base import Mesostructure, Part, square_below
 from btfref.mesostructure.checks import colour, number, sweep_faces, whole
+
+if TYPE_CHECKING:
+    from btfref.types import Facts
 
 #: Smallest clearance between two yarns, in half thicknesses: far above what facets take off.
 _CLEARANCE = 0.02
@@ -18,19 +24,19 @@ _CLEARANCE = 0.02
 
 def tissue(
     *,
-    count=4,
-    width=0.8,
-    thickness=0.08,
-    amplitude=0.05,
-    segments=96,
-    sides=20,
-    warp_colour=(0.62, 0.10, 0.08),
-    weft_colour=(0.75, 0.62, 0.40),
-    roughness=0.45,
-    anisotropy=0.7,
-    sheen=0.6,
-    backing_colour=(0.03, 0.03, 0.035),
-):
+    count: int = 4,
+    width: float = 0.8,
+    thickness: float = 0.08,
+    amplitude: float = 0.05,
+    segments: int = 96,
+    sides: int = 20,
+    warp_colour: Sequence[float] = (0.62, 0.10, 0.08),
+    weft_colour: Sequence[float] = (0.75, 0.62, 0.40),
+    roughness: float = 0.45,
+    anisotropy: float = 0.7,
+    sheen: float = 0.6,
+    backing_colour: Sequence[float] | None = (0.03, 0.03, 0.035),
+) -> Mesostructure:
     """Warp along x, weft along y, each an elliptic tube whose axis follows a cosine.
 
     With pitch p = 1/count, half width w and half thickness t, warp and weft are apart where
@@ -89,7 +95,7 @@ def tissue(
             expected="a larger one, or narrower or thinner yarns",
         )
 
-    def fibre(base):
+    def fibre(base: Sequence[float]) -> Facts:
         return {
             "type": "principled",
             "base_color": {"type": "rgb", "value": base},
@@ -115,9 +121,8 @@ def tissue(
     ]
     if backing_colour is not None:
         low = min(part.vertices[:, 2].min() for part in parts) - 0.05 * thickness
-        square = np.array([[0, 0, low], [1, 0, low], [1, 1, low], [0, 1, low]], np.float64)
         cloth = {"type": "diffuse", "reflectance": {"type": "rgb", "value": backing_colour}}
-        parts.append(Part(square, [[0, 1, 2], [0, 2, 3]], cloth, normals=np.tile([0.0, 0.0, 1.0], (4, 1))))
+        parts.append(square_below(low, cloth))
     parameters = {
         "count": count,
         "width": width,
@@ -135,7 +140,9 @@ def tissue(
     return Mesostructure("tissue", parameters, tuple(parts))
 
 
-def _yarns(count, width, thickness, amplitude, segments, sides):
+def _yarns(
+    count: int, width: float, thickness: float, amplitude: float, segments: int, sides: int
+) -> tuple[np.ndarray, ...]:
     """Warp yarns: vertices, normals, texture coordinates (u along the yarn) and faces, z around 0."""
     n_along = segments + 1
     x = np.arange(n_along) / segments

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-def reason_against_surface(bsdfs):
+if TYPE_CHECKING:
+    from btfref.types import JitArray
+
+
+def reason_against_surface(bsdfs: Sequence[JitArray]) -> str | None:
     """Why the estimator ``surface`` cannot be used; None where it can.
 
     Its points scatter light on the side it came from, with BSDFs that can be evaluated: light that passes

@@ -5,6 +5,9 @@ What is made together, in which order and by which process has no influence on a
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING, TypeVar
+
 import numpy as np
 
 from btfref.sampling.memory import blocks
@@ -12,11 +15,30 @@ from btfref.sampling.paths import adaptive
 from btfref.sampling.store.selection import Selection
 from btfref.sampling.variant import mitsuba_variant
 
+if TYPE_CHECKING:
+    from btfref.sampling.job import Job
+    from btfref.sampling.memory import Blocks
+    from btfref.sampling.paths.adaptive import Plan
+    from btfref.sampling.paths.texels import Request
+    from btfref.sampling.store.store import BTFStore
+
+_Indices = TypeVar("_Indices", list[int], np.ndarray)
+
 #: Streams of random numbers of a synthesis to a target error.
 _PILOT, _ESTIMATE = 1, 2
 
 
-def fill_views(job, store, views, *, stage, only=None, plan=None, memory, done=None):
+def fill_views(
+    job: Job,
+    store: BTFStore,
+    views: Iterable[int],
+    *,
+    stage: str,
+    only: Selection | None = None,
+    plan: Plan | None = None,
+    memory: int,
+    done: Callable[[int], object] | None = None,
+) -> None:
     """Make what is missing of some views.
 
     Parameters
@@ -68,40 +90,41 @@ def fill_views(job, store, views, *, stage, only=None, plan=None, memory, done=N
                 done(view)
 
 
-def _regions(store):
-    """Texels of one file each: (rows, columns) of texels as slices, and its tiles."""
+def _regions(store: BTFStore) -> Iterator[tuple[slice, slice, np.ndarray]]:
+    """Texels of one file each: rows and columns of texels, and its tiles."""
     rows, columns = store.coverage_shape
     for first_row in range(0, rows, store.shard[0]):
         for first_column in range(0, columns, store.shard[1]):
             last = min(first_row + store.shard[0], rows), min(first_column + store.shard[1], columns)
             tiles = np.mgrid[first_row : last[0], first_column : last[1]].reshape(2, -1)
-            sides = [
+            row, column = (
                 slice(a * t, min(b * t, n))
                 for a, b, t, n in zip((first_row, first_column), last, store.tile, store.texels, strict=True)
-            ]
-            yield sides, tiles
+            )
+            yield row, column, tiles
 
 
 # --- paths: texel by texel
 
 
-def _fill_by_texels(job, store, views, only, plan, size):
+def _fill_by_texels(
+    job: Job, store: BTFStore, views: list[int], only: Selection, plan: Plan | None, size: Blocks
+) -> Iterator[int]:
     *_, tiles = only.indices(store)
     pairs = only.wanted(store)
     wanted = np.zeros(store.coverage_shape, bool)
     wanted[tiles] = True
     estimator = job.make_estimator(views, buffer=size.buffer)
     requests = _requests(store, views, pairs, wanted, plan)
-    for request, *found in estimator.estimate_all(requests):
+    for request, mean, variance in estimator.estimate_all(requests):
         row, column, chosen, inside, last = request.tag
         if len(request.texel):
-            at = np.nonzero(inside)
             shape = (len(request.lights), *inside.shape, 3)
             result = []
-            for values in found[: 1 + store.has_variance]:
+            for values in (mean, variance)[: 1 + store.has_variance]:
                 if not inside.all():
                     whole = np.zeros(shape, np.float32)
-                    whole[:, *at] = values
+                    whole[:, inside] = values
                     values = whole
                 result.append(values.reshape(shape))
             if plan is not None:
@@ -112,7 +135,9 @@ def _fill_by_texels(job, store, views, only, plan, size):
             yield request.view
 
 
-def _requests(store, views, pairs, wanted, plan):
+def _requests(
+    store: BTFStore, views: list[int], pairs: np.ndarray, wanted: np.ndarray, plan: Plan | None
+) -> Iterator[Request]:
     """What is missing of some views, file by file; with where it goes, and whether it is the last of its view."""
     from btfref.sampling.paths.texels import Request
 
@@ -120,11 +145,12 @@ def _requests(store, views, pairs, wanted, plan):
     for view in views:
         absent = pairs[view][:, None, None] & wanted & ~store.covered(view)
         lights, missing = np.flatnonzero(absent.any((1, 2))), absent.any(0)
-        counts, stream = None, ()
+        counts: np.ndarray | None = None
+        stream: tuple[int, ...] = ()
         if plan is not None:
-            counts, stream = plan.counts(store.maps("pilot")[view]), (_ESTIMATE,)
+            counts, stream = plan.counts(store.read_map("pilot", view)), (_ESTIMATE,)
             store.write_map("samples", view, counts)
-        for number, ((row, column), region) in enumerate(regions, 1):
+        for number, (row, column, region) in enumerate(regions, 1):
             inside = missing[np.ix_(_tile_of(row, store.tile[0]), _tile_of(column, store.tile[1]))]
             rows, columns = np.nonzero(inside)
             texel = (row.start + rows) * store.texels[1] + column.start + columns
@@ -134,24 +160,26 @@ def _requests(store, views, pairs, wanted, plan):
                 lights,
                 None if counts is None else counts.ravel()[texel],
                 stream,
-                (row, column, region[:, missing[tuple(region)]], inside, number == len(regions)),
+                (row, column, region[:, missing[region[0], region[1]]], inside, number == len(regions)),
             )
 
 
-def _tile_of(part, side):
+def _tile_of(part: slice, side: int) -> np.ndarray:
     return np.arange(part.start, part.stop) // side
 
 
-def _pilot_by_texels(job, store, views, only, plan, size):
+def _pilot_by_texels(
+    job: Job, store: BTFStore, views: list[int], only: Selection, plan: Plan | None, size: Blocks
+) -> Iterator[int]:
     estimator = job.make_estimator(views, buffer=size.buffer)
     columns = store.texels[1]
     for view in views:
         pilot = np.zeros((*store.texels, 3), np.float32)
-        for (row, column), _ in _regions(store):
+        for row, column, _ in _regions(store):
             texel = (np.arange(row.start, row.stop)[:, None] * columns + np.arange(columns)[column]).ravel()
             counts = np.full(len(texel), adaptive.PILOT)
-            pilots = [estimator.estimate(view, texel, counts, (_PILOT, k)) for k in (0, 1)]
-            found = adaptive.pilot_map(*pilots, adaptive.PILOT)
+            one, two = (estimator.estimate(view, texel, counts, (_PILOT, k)) for k in (0, 1))
+            found = adaptive.pilot_map(one, two, adaptive.PILOT)
             pilot[row, column] = found.reshape(row.stop - row.start, column.stop - column.start, 3)
         store.write_map("pilot", view, pilot)
         yield view
@@ -160,7 +188,9 @@ def _pilot_by_texels(job, store, views, only, plan, size):
 # --- surface points: whole views
 
 
-def _fill_by_views(job, store, views, only, plan, size):
+def _fill_by_views(
+    job: Job, store: BTFStore, views: list[int], only: Selection, plan: Plan | None, size: Blocks
+) -> Iterator[int]:
     *_, tiles = only.indices(store)
     pairs = only.wanted(store)
     mask = None if len(tiles[0]) == np.prod(store.coverage_shape) else only.mask(store)
@@ -170,11 +200,11 @@ def _fill_by_views(job, store, views, only, plan, size):
             estimator = job.make_estimator(group, lights=chosen, mask=mask)
             for view, mean, variance in estimator.all_views(group):
                 mine = pairs[view, chosen]
-                parts = (mean, variance if store.has_variance else None)
-                if not mine.all():
-                    parts = (None if part is None else part[mine] for part in parts)
+                # A slice copies nothing; these arrays are large.
+                some = slice(None) if mine.all() else mine
                 if mine.any():
-                    store.write_part(view, chosen[mine], tiles, *parts)
+                    spread = variance[some] if store.has_variance else None
+                    store.write_part(view, chosen[mine], tiles, mean[some], spread)
                 if len(chosen) == len(lights):
                     yield view
             del estimator
@@ -182,22 +212,24 @@ def _fill_by_views(job, store, views, only, plan, size):
             yield from group
 
 
-def _groups(items, size):
+def _groups(items: _Indices, size: int) -> list[_Indices]:
     return [items[first : first + size] for first in range(0, len(items), size)]
 
 
-def _passes(job, group, passes):
+def _passes(
+    job: Job, group: list[int], passes: dict[int, int]
+) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """Sums over passes of independent points: (view, mean, variance of the mean) of each view."""
-    sums = {view: None for view in group}
+    sums: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     for number in range(max(passes.values())):
         still = [view for view in group if passes[view] > number]
         estimator = job.make_estimator(still, spp=adaptive.SURFACE_POINTS, stream=(_ESTIMATE, number))
         for view, mean, variance in estimator.all_views(still):
-            if sums[view] is None:
-                sums[view] = [mean.copy(), variance.copy()]
+            if view not in sums:
+                sums[view] = mean.copy(), variance.copy()
             else:
-                sums[view][0] += mean
-                sums[view][1] += variance
+                for total, term in zip(sums[view], (mean, variance), strict=True):
+                    total += term
         del estimator
         for view in group:
             if passes[view] == number + 1:
@@ -205,9 +237,12 @@ def _passes(job, group, passes):
                 yield view, mean / np.float32(passes[view]), variance / np.float32(passes[view] ** 2)
 
 
-def _fill_by_passes(job, store, views, only, plan, size):
+def _fill_by_passes(
+    job: Job, store: BTFStore, views: list[int], only: Selection, plan: Plan | None, size: Blocks
+) -> Iterator[int]:
+    assert plan is not None, "passes are counted by a plan"
     _, lights, tiles = only.indices(store)
-    counts = {view: plan.counts(store.maps("pilot")[view]) for view in views}
+    counts = {view: plan.counts(store.read_map("pilot", view)) for view in views}
     passes = {view: int(counts[view].max()) for view in views}
     # Views of alike numbers of passes go together, so that most passes are of all views of their group.
     order = sorted(views, key=lambda view: (passes[view], view))
@@ -220,7 +255,9 @@ def _fill_by_passes(job, store, views, only, plan, size):
             yield view
 
 
-def _pilot_by_views(job, store, views, only, plan, size):
+def _pilot_by_views(
+    job: Job, store: BTFStore, views: list[int], only: Selection, plan: Plan | None, size: Blocks
+) -> Iterator[int]:
     for group in _groups(views, size.views):
         estimator = job.make_estimator(group, spp=adaptive.SURFACE_POINTS, stream=(_PILOT, 0))
         for view, mean, variance in estimator.all_views(group):
@@ -230,9 +267,11 @@ def _pilot_by_views(job, store, views, only, plan, size):
         del estimator
 
 
-def _record_part(store, view, row, column, inside, means):
+def _record_part(
+    store: BTFStore, view: int, row: slice, column: slice, inside: np.ndarray, means: np.ndarray
+) -> None:
     """Note what was reached in some texels of a view; the others keep what is known of them."""
-    whole = store.maps("reached")[view]
+    whole = store.read_map("reached", view)
     part = whole[row, column]
     whole[row, column] = np.where(inside[..., None], means, part)
     store.write_map("reached", view, whole)

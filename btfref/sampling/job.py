@@ -145,11 +145,10 @@ class Job:
     ) -> list[int]:
         """Those of some views that a stage has not made yet."""
         if stage == "pilot":
-            pilots = store.maps("pilot")
-            return [int(view) for view in views if not np.isfinite(pilots[view, 0, 0, 0])]
+            return [int(view) for view in views if not np.isfinite(store.read_map("pilot", view)[0, 0, 0])]
         only = only or Selection()
         wanted, (*_, tiles) = only.wanted(store), only.indices(store)
-        covered = store.coverage[:, :, tiles[0], tiles[1]].all(-1)
+        covered = np.all(store.coverage[:, :, tiles[0], tiles[1]], axis=-1)
         return [int(view) for view in views if (wanted[view] & ~covered[view]).any()]
 
     def to_store(
@@ -204,7 +203,7 @@ class Job:
                 **means,
             )
             plan = adaptive.make_plan(
-                lambda: (store.maps("pilot")[view] for view in every),
+                lambda: (store.read_map("pilot", view) for view in every),
                 target=settings.target_error,
                 texel_error=settings.texel_error,
                 most=self._most(),

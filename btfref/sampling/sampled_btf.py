@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +20,10 @@ from btfref.types import Facts
 
 #: By how much the length of a direction may differ from 1: vectors written with four digits are let through.
 UNIT_TOLERANCE = 1e-3
+
+if TYPE_CHECKING:
+    from btfref.sampling.store.store import Choice
+    from btfref.types import PathLike
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -105,12 +110,22 @@ class SampledBTF:
         return in_one_line(kind, self.texels, self.views.facts, self.lights.facts, self.values.nbytes)
 
     @property
-    def texels(self):
+    def texels(self) -> tuple[int, int]:
         """Rows and columns."""
         return self.values.shape[2:4]
 
     @classmethod
-    def load(cls, path, *, views=None, lights=None, rows=None, columns=None, variance=True, partial=False):
+    def load(
+        cls,
+        path: PathLike,
+        *,
+        views: Choice = None,
+        lights: Choice = None,
+        rows: Choice = None,
+        columns: Choice = None,
+        variance: bool = True,
+        partial: bool = False,
+    ) -> SampledBTF:
         """Read a store, or a part of it.
 
         Parameters
@@ -157,7 +172,7 @@ class SampledBTF:
             parts[name] = directions
         return cls(values, **parts, variance=spread, attributes=store.attributes, path=store.path)
 
-    def save(self, path, *, overwrite=False, tile=TILE):
+    def save(self, path: PathLike, *, overwrite: bool = False, tile: int = TILE) -> None:
         """Write a store; it appears under its name only when it is complete.
 
         Parameters

@@ -5,13 +5,24 @@ from __future__ import annotations
 import contextlib
 import pickle
 import threading
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias, TypedDict
 
 from btfref.errors import InputError, MissingDependencyError
 from btfref.sampling.fill_views import fill_views
 from btfref.sampling.memory import default_budget, peak
 from btfref.sampling.store.layout import DRAFT
 from btfref.sampling.store.store import open_store
+
+if TYPE_CHECKING:
+    import distributed
+
+    from btfref.sampling.job import Job
+    from btfref.sampling.paths.adaptive import Plan
+    from btfref.sampling.store.selection import Selection
+    from btfref.sampling.store.store import BTFStore
+    from btfref.types import Progress
 
 #: Tasks per worker: enough that a slow or lost worker costs little, few enough that scenes are not built for nothing.
 TASKS_PER_WORKER = 6
@@ -20,19 +31,30 @@ TASKS_PER_WORKER = 6
 _LOCK = threading.Lock()
 
 
+#: None, the name or the address of a cluster, or a client of one.
+Scheduler: TypeAlias = "str | distributed.Client | None"
+
+
+class _Means(TypedDict):
+    """What a worker is told: its budget in bytes, None for half of its machine's; its threads, None for as it is."""
+
+    memory: int | None
+    threads: int | None
+
+
 def run(
-    job,
-    store,
-    views,
+    job: Job,
+    store: BTFStore,
+    views: Iterable[int],
     *,
-    stage,
-    only=None,
-    plan=None,
-    memory=None,
-    scheduler=None,
-    workers=None,
-    progress=None,
-):
+    stage: str,
+    only: Selection | None = None,
+    plan: Plan | None = None,
+    memory: int | None = None,
+    scheduler: Scheduler = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> int:
     """Fill views of a store; see `btfref.sampling.fill_views.fill_views`.
 
     Parameters
@@ -65,7 +87,7 @@ def run(
     views = [int(view) for view in views]
     total, finished = len(views), [0]
 
-    def done(n):
+    def done(n: int) -> None:
         finished[0] += n
         if progress is not None:
             progress(finished[0], total, stage)
@@ -83,7 +105,9 @@ def run(
 
 
 @contextlib.contextmanager
-def _client(scheduler, workers, memory):
+def _client(
+    scheduler: Scheduler, workers: int | None, memory: int | None
+) -> Iterator[tuple[distributed.Client, _Means]]:
     """A client, and what its workers are told: budget and threads of each."""
     try:
         import distributed
@@ -98,7 +122,7 @@ def _client(scheduler, workers, memory):
         yield scheduler, {"memory": memory, "threads": None}
         return
     if scheduler == "dask":
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         count = max(1, cores // 2) if workers is None else int(workers)
         if count < 1:
             raise InputError(
@@ -133,7 +157,17 @@ def _client(scheduler, workers, memory):
         yield client, {"memory": memory, "threads": None}
 
 
-def _distribute(client, job, store, views, stage, only, plan, settings, done):
+def _distribute(
+    client: distributed.Client,
+    job: Job,
+    store: BTFStore,
+    views: list[int],
+    stage: str,
+    only: Selection | None,
+    plan: Plan | None,
+    settings: _Means,
+    done: Callable[[int], None],
+) -> int:
     """Hand the views out; what a lost worker had not finished goes to another."""
     import distributed
 
@@ -179,7 +213,7 @@ def _distribute(client, job, store, views, stage, only, plan, settings, done):
         order.unlink(missing_ok=True)
 
 
-def _work(order, path, views, stage, settings):
+def _work(order: str, path: str, views: list[int], stage: str, settings: _Means) -> tuple[int, int]:
     """What a worker does: fill its views; the number of views and the worker's largest memory."""
     from distributed import get_worker
 
@@ -204,7 +238,7 @@ def _work(order, path, views, stage, settings):
         return len(views), peak()
 
 
-def _use_threads(job, threads):
+def _use_threads(job: Job, threads: int) -> None:
     """Tell Dr.Jit how many threads this worker may use."""
     from btfref.sampling.variant import mitsuba_variant
 

@@ -122,7 +122,7 @@ class SynthesisSettings:
     @cached_property
     def sides(self) -> tuple[int, int]:
         """Rows and columns of texels."""
-        texels = self.texels
+        texels: Any = self.texels
         try:
             sides = [texels, texels] if isinstance(texels, int | str) else list(texels)
         except TypeError:  # a number of another kind
@@ -192,19 +192,21 @@ class SynthesisSettings:
         return {"seed": self.seed, "estimator": self.estimator, "parameters": parameters}
 
 
-def _whole(name: str, value: object, low: int, high: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, Integral) or not low <= value <= high:
+def _whole(name: str, value: Any, low: int, high: int) -> int:
+    whole = isinstance(value, Integral) and not isinstance(value, bool)
+    if not whole or not low <= value <= high:
         raise InputError(
             "setting of the synthesis", field=name, got=value, expected=f"a whole number in [{low}, {high}]"
         )
     return int(value)
 
 
-def _share(name: str, value: object) -> float | None:
+def _share(name: str, value: Any) -> float | None:
     """A relative error, or None."""
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, Real) or not 1e-5 <= value <= 10:
+    number = isinstance(value, Real) and not isinstance(value, bool)
+    if not number or not 1e-5 <= value <= 10:
         raise InputError(
             "setting of the synthesis", field=name, got=value, expected="a number in [1e-5, 10], 0.02 for 2 %"
         )

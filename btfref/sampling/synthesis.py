@@ -75,7 +75,7 @@ def synthesize(
     texel's square on the sampling plane z = 0, seen along the view: oblique views have sheared footprints.
     """
     job = make_job(mesostructure, settings, keywords)
-    means = {"memory": memory, "scheduler": scheduler, "workers": workers}
+    means: dict[str, Any] = {"memory": memory, "scheduler": scheduler, "workers": workers}
     if out is not None:
         return SampledBTF.load(job.to_store(out, overwrite=overwrite, progress=progress, **means).path)
     if scheduler is not None:

@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from btfref.mesostructure.base import Mesostructure
+    from btfref.types import JitArray
 
 #: Largest number of tiles on each side of the central one; beyond it rays are wrapped instead.
 MAXIMUM_REACH = 4
@@ -33,7 +41,7 @@ class TiledScene:
         One per part.
     """
 
-    def __init__(self, mesostructure, directions):
+    def __init__(self, mesostructure: Mesostructure, directions: ArrayLike) -> None:
         import mitsuba as mi
 
         from btfref.mesostructure.materials import load_bsdf
@@ -55,13 +63,13 @@ class TiledScene:
         shapes = tiled_shapes(mesostructure, offsets, offsets, bsdfs=self.bsdfs)
         self.scene = mi.load_dict({"type": "scene", **shapes})
 
-    def _travel(self, direction):
+    def _travel(self, direction: JitArray) -> JitArray:
         """Distance along a ray from the central tile that surely stays in the patch."""
         import drjit as dr
 
         return dr.minimum(self.reach / dr.maximum(dr.abs(direction.x), dr.abs(direction.y)), 1e4)
 
-    def _wrapped(self, origin, direction, travel):
+    def _wrapped(self, origin: JitArray, direction: JitArray, travel: JitArray) -> tuple[JitArray, JitArray]:
         """The place at the patch's border, taken to the central tile, and whether the slab goes on there."""
         import drjit as dr
         import mitsuba as mi
@@ -70,7 +78,7 @@ class TiledScene:
         inside = dr.select(direction.z <= 0, end.z >= self.low, end.z <= self.high)
         return mi.Point3f(end.x - dr.floor(end.x), end.y - dr.floor(end.y), end.z), inside
 
-    def intersect(self, origin, direction):
+    def intersect(self, origin: JitArray, direction: JitArray) -> JitArray:
         """First hit of rays on the infinitely tiled surface, moved to the central tile.
 
         Parameters
@@ -84,7 +92,7 @@ class TiledScene:
         """
         return self.locate(origin, direction)[0]
 
-    def locate(self, origin, direction):
+    def locate(self, origin: JitArray, direction: JitArray) -> tuple[JitArray, JitArray]:
         """As `intersect`, and the preliminary intersection, which knows the triangle."""
         import drjit as dr
         import mitsuba as mi
@@ -92,7 +100,9 @@ class TiledScene:
         travel = self._travel(direction)
         origin = mi.Point3f(origin.x - dr.floor(origin.x), origin.y - dr.floor(origin.y), origin.z)
 
-        def search(origin, hit, searching, rounds):
+        def search(
+            origin: JitArray, hit: JitArray, searching: JitArray, rounds: JitArray
+        ) -> tuple[JitArray, ...]:
             ray = mi.Ray3f(origin, direction)
             ray.maxt = travel
             hit = self.scene.ray_intersect_preliminary(ray, coherent=False, active=searching)
@@ -114,7 +124,7 @@ class TiledScene:
         interaction.p = mi.Point3f(p.x - dr.floor(p.x), p.y - dr.floor(p.y), p.z)
         return interaction, hit
 
-    def occluded(self, ray, active, *, coherent=True):
+    def occluded(self, ray: JitArray, active: JitArray, *, coherent: bool = True) -> JitArray:
         """Whether the infinitely tiled surface blocks rays that start in the central tile.
 
         Parameters
@@ -135,7 +145,9 @@ class TiledScene:
             return self.scene.ray_test(ray, coherent=coherent, active=active)
         travel, direction = self._travel(ray.d), mi.Vector3f(ray.d)
 
-        def search(origin, blocked, searching, rounds):
+        def search(
+            origin: JitArray, blocked: JitArray, searching: JitArray, rounds: JitArray
+        ) -> tuple[JitArray, ...]:
             part = mi.Ray3f(origin, direction)
             part.maxt = travel
             blocked = blocked | self.scene.ray_test(part, coherent=coherent, active=searching)
@@ -147,7 +159,9 @@ class TiledScene:
         return dr.while_loop(state, lambda origin, blocked, searching, rounds: searching, search)[1]
 
 
-def uniforms(lane, keys, dimension):
+def uniforms(
+    lane: JitArray, keys: Sequence[JitArray], dimension: JitArray
+) -> tuple[JitArray, JitArray, JitArray, JitArray]:
     """Four numbers in [0, 1) per lane and dimension: counter-based, so that no state travels with a path."""
     import mitsuba as mi
 
@@ -156,7 +170,7 @@ def uniforms(lane, keys, dimension):
     return tuple(mi.Float(word >> 8) * 2.0**-24 for word in words)
 
 
-def stream_keys(*words):
+def stream_keys(*words: int) -> list[JitArray]:
     """Two opaque words that select a stream of `uniforms`; from any number of integers."""
     import drjit as dr
     import mitsuba as mi
@@ -164,13 +178,13 @@ def stream_keys(*words):
     return [dr.opaque(mi.UInt32, word) for word in stream_words(*words)]
 
 
-def stream_words(*words):
+def stream_words(*words: int) -> tuple[int, int]:
     """The two words as numbers."""
-    state = np.random.SeedSequence([int(word) for word in words]).generate_state(2, np.uint32)
-    return tuple(int(word) for word in state)
+    a, b = np.random.SeedSequence([int(word) for word in words]).generate_state(2, np.uint32)
+    return int(a), int(b)
 
 
-def rotated(u, v, number):
+def rotated(u: JitArray, v: JitArray, number: JitArray) -> tuple[JitArray, JitArray]:
     """Two numbers in [0, 1) moved along the R2 sequence (Roberts 2018), modulo 1.
 
     Any of them is as uniform as the first; those of successive numbers fill the square evenly.

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import gc
+from collections.abc import Iterator
 from contextlib import contextmanager
+from types import ModuleType
 
 from btfref.errors import InputError
 
 
 @contextmanager
-def mitsuba_variant(variant):
+def mitsuba_variant(variant: str) -> Iterator[ModuleType]:
     """Run a block under a Mitsuba variant; the variant set before is restored.
 
     Parameters
@@ -48,7 +50,7 @@ def mitsuba_variant(variant):
 
 
 @contextmanager
-def no_collection():
+def no_collection() -> Iterator[None]:
     """Keep Python's cyclic garbage while a block traces kernels.
 
     Dr.Jit lists all materials that exist and then calls them one after the other. A material in Python can start a

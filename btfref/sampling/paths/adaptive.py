@@ -16,9 +16,15 @@ the same number of passes.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from btfref.sampling.store.store import BTFStore
+    from btfref.types import Facts
 
 #: Samples of each pilot, per texel and view.
 PILOT = 8
@@ -64,7 +70,7 @@ class Plan:
     most: int
     whole_views: bool
 
-    def counts(self, pilot):
+    def counts(self, pilot: np.ndarray) -> np.ndarray:
         """Samples of each texel of a view; passes where these are of whole views.
 
         Parameters
@@ -80,7 +86,7 @@ class Plan:
         spread, least = self.demand(pilot[..., :2].mean(-1), pilot[..., 2])
         return self.rounded(np.maximum(self.scale * np.sqrt(spread), least)).reshape(pilot.shape[:2])
 
-    def demand(self, spread, mean):
+    def demand(self, spread: np.ndarray, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Variance of one sample, and the number of samples for the texel's own sake; (cells,) each."""
         # A texel whose few samples saw nothing unusual has neighbours that did.
         around = sum(np.roll(spread, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)) / 9
@@ -94,7 +100,7 @@ class Plan:
             return np.full(spread.size, spread.mean()), np.full(spread.size, least.max())
         return smooth.ravel(), least.ravel()
 
-    def rounded(self, wanted):
+    def rounded(self, wanted: np.ndarray) -> np.ndarray:
         """Numbers that there are: passes, or 8, 12, 16, 24, … samples."""
         if self.whole_views:
             return np.clip(np.ceil(wanted), 1, self.most).astype(np.int64)
@@ -105,7 +111,14 @@ class Plan:
         return np.minimum((LEAST * power * up).astype(np.int64), self.most)
 
 
-def make_plan(pilots, *, target, texel_error, most, whole_views):
+def make_plan(
+    pilots: Callable[[], Iterable[np.ndarray]],
+    *,
+    target: float,
+    texel_error: float | None,
+    most: int,
+    whole_views: bool,
+) -> Plan:
     """Fix the numbers of samples from the pilot of all views.
 
     Parameters
@@ -131,7 +144,7 @@ def make_plan(pilots, *, target, texel_error, most, whole_views):
         return plan
     # All that matters of a texel is its s, what it needs for itself, and what the other pilot says of it: classes
     # of the first two, with sums of the third, hold any number of texels.
-    sums = {}
+    sums: dict[tuple[int, int], float] = {}
     for pilot in pilots():
         pilot = np.asarray(pilot, np.float64)
         for made, judged in ((0, 1), (1, 0)):
@@ -148,7 +161,7 @@ def make_plan(pilots, *, target, texel_error, most, whole_views):
     variance = np.array(list(sums.values()))
     goal = (target * mean) ** 2 * count
 
-    def predicted(scale):
+    def predicted(scale: float) -> float:
         return (variance / plan.rounded(np.maximum(scale * s, own))).sum()
 
     low, high = -80.0, 80.0
@@ -158,21 +171,23 @@ def make_plan(pilots, *, target, texel_error, most, whole_views):
     return Plan(float(np.exp(high)), mean, texel_error, most, whole_views)
 
 
-def texel_means(mean, variance):
+def texel_means(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """Variance and mean of texels over lights and channels: (lights, …, 3) twice to (…, 2) float32."""
     return np.stack([a.mean(axis=(0, -1), dtype=np.float64) for a in (variance, mean)], axis=-1).astype(
         np.float32
     )
 
 
-def pilot_map(first, second, samples):
+def pilot_map(
+    first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray], samples: int
+) -> np.ndarray:
     """The map of a view's pilots from two pairs (mean, variance of the mean), each (lights, …, 3)."""
-    first, second = texel_means(*first), texel_means(*second)
-    mean = 0.5 * (first[..., 1] + second[..., 1])
-    return np.stack([samples * first[..., 0], samples * second[..., 0], mean], -1)
+    one, two = texel_means(*first), texel_means(*second)
+    mean = 0.5 * (one[..., 1] + two[..., 1])
+    return np.stack([samples * one[..., 0], samples * two[..., 0], mean], -1)
 
 
-def summary(store):
+def summary(store: BTFStore) -> Facts | None:
     """What a synthesis to a target error has reached so far.
 
     Parameters
@@ -188,19 +203,20 @@ def summary(store):
     if store.maps("reached") is None:
         return None
     parameters = store.attributes["parameters"]
-    seen = [view for view in range(len(store.views)) if np.isfinite(store.maps("reached")[view, 0, 0, 0])]
+    seen = [view for view in range(len(store.views)) if np.isfinite(store.read_map("reached", view)[0, 0, 0])]
     if not seen:
         return None
     variance = mean = worst = 0.0
     above = count = total = 0
-    least, most = np.inf, 0
-    everything = np.mean([np.nanmean(store.maps("reached")[view][..., 1], dtype=np.float64) for view in seen])
+    least, most = np.iinfo(np.int64).max, 0
+    means = [np.nanmean(store.read_map("reached", view)[..., 1], dtype=np.float64) for view in seen]
+    dark = max(FLOOR * float(np.mean(means)), 1e-30)
     for view in seen:
-        spread, value = np.asarray(store.maps("reached")[view], np.float64).transpose(2, 0, 1)
+        spread, value = store.read_map("reached", view).astype(np.float64).transpose(2, 0, 1)
         there = np.isfinite(spread)
-        samples = store.maps("samples")[view][there]
+        samples = store.read_map("samples", view)[there]
         spread, value = spread[there], value[there]
-        relative = np.sqrt(spread) / np.maximum(value, max(FLOOR * everything, 1e-30))
+        relative = np.sqrt(spread) / np.maximum(value, dark)
         variance, mean, count = variance + spread.sum(), mean + value.sum(), count + spread.size
         worst = max(worst, float(relative.max()))
         if parameters["texel_error"] is not None:

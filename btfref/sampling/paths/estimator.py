@@ -11,11 +11,19 @@ the same for all lights, so the lights of a texel are correlated, its samples ar
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.sampling.tiled_scene import TiledScene, uniforms
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from btfref.mesostructure.base import Mesostructure
+    from btfref.types import JitArray
 
 #: Memory (bytes) of the sample buffer of one pass; reduction needs about three times that.
 SAMPLE_BUFFER = 96 << 20
@@ -27,7 +35,7 @@ ROULETTE_VERTEX = 3
 ROULETTE_LIMIT = 0.95
 
 
-def strata(spp):
+def strata(spp: int) -> tuple[int, int, int]:
     """How the samples of one texel are stratified over its square.
 
     Each stratum holds m ≥ 2 independent samples, m the smallest prime factor of ``spp``; the spread inside
@@ -64,12 +72,12 @@ class Piece:
     """
 
     w_view: np.ndarray
-    keys: tuple
+    keys: tuple[int, int]
     lights: np.ndarray
     n_lanes: int
 
     @property
-    def size(self):
+    def size(self) -> int:
         """Numbers of the sample buffer: [light, channel, lane]."""
         return 3 * len(self.lights) * self.n_lanes
 
@@ -106,15 +114,34 @@ class PathEstimator:
     key = "path"
 
     def __init__(
-        self, mesostructure, lights, *, texels, spp, seed, max_depth, views=None, wanted=None, mask=None
-    ):
-        self.texels, self.spp, self.seed = tuple(texels), int(spp), int(seed)
+        self,
+        mesostructure: Mesostructure,
+        lights: ArrayLike,
+        *,
+        texels: Sequence[int],
+        spp: int,
+        seed: int,
+        max_depth: int,
+        views: np.ndarray,
+        wanted: Sequence[int] | None = None,
+        mask: np.ndarray | None = None,
+    ) -> None:
+        rows, columns = texels
+        self.texels, self.spp, self.seed = (int(rows), int(columns)), int(spp), int(seed)
         self.max_depth, self.views, self.mask = int(max_depth), views, mask
         self.lights = np.asarray(lights, dtype=np.float64)
         self.tiles = TiledScene(mesostructure, self.lights)
-        self._buffer = None
+        self._buffer: JitArray = None
 
-    def _paths(self, pieces):
+    def _stream(self, lane: JitArray) -> JitArray:
+        """Random stream of each lane."""
+        raise NotImplementedError
+
+    def _footprint(self, lane: JitArray, keys: Sequence[JitArray], w_view: JitArray) -> JitArray:
+        """Start of each lane's view ray."""
+        raise NotImplementedError
+
+    def _paths(self, pieces: Sequence[Piece]) -> None:
         """Fill the buffer with the samples of one pass: lanes and samples of its pieces one after the other."""
         import drjit as dr
         import mitsuba as mi
@@ -142,7 +169,7 @@ class PathEstimator:
             state = tuple(dr.gather(type(value), value, survivors) for value in state)
             vertex += 1
 
-    def _tell(self, pieces):
+    def _tell(self, pieces: Sequence[Piece]) -> None:
         """Tables of the pieces, and the piece of each lane."""
         import mitsuba as mi
 
@@ -153,23 +180,23 @@ class PathEstimator:
         first, base, start = (np.cumsum(a) - a for a in (lanes, sizes, lit))
         words = [[piece.keys[k] for piece in pieces] for k in (0, 1)]
         # Samples of a lane: base − first lane of the piece + lane + 3 n_lanes times the light.
-        words = np.stack([*words, start, lit, base - first, lanes], 1).astype(np.int64) % 2**32
+        table = np.stack([*words, start, lit, base - first, lanes], 1).astype(np.int64) % 2**32
         self._piece = mi.UInt32(np.repeat(np.arange(len(pieces), dtype=np.uint32), lanes))
-        self._words = mi.UInt32(words.astype(np.uint32).ravel())
+        self._words = mi.UInt32(table.astype(np.uint32).ravel())
         self._views = mi.Float(np.array([piece.w_view for piece in pieces], np.float32).ravel())
         self._lights = mi.Float(np.concatenate([piece.lights for piece in pieces]).astype(np.float32).ravel())
 
-    def _word(self, lane, number):
+    def _word(self, lane: JitArray, number: int) -> JitArray:
         import drjit as dr
 
         piece = dr.gather(type(lane), self._piece, lane)
         return dr.gather(type(lane), self._words, piece * 6 + number)
 
-    def _keys(self, lane):
+    def _keys(self, lane: JitArray) -> list[JitArray]:
         """Words that select the random streams of the lanes' pieces."""
         return [self._word(lane, 0), self._word(lane, 1)]
 
-    def _vertex(self, state, number):
+    def _vertex(self, state: tuple[JitArray, ...], number: int) -> tuple[tuple[JitArray, ...], JitArray]:
         """Trace to the next vertex, connect it to all lights, sample the way on; one kernel."""
         import drjit as dr
         import mitsuba as mi
@@ -196,7 +223,17 @@ class PathEstimator:
         dr.eval(state, alive)
         return state, alive
 
-    def _connect(self, interaction, bsdf, context, throughput, lane, active, *, first_vertex):
+    def _connect(
+        self,
+        interaction: JitArray,
+        bsdf: JitArray,
+        context: JitArray,
+        throughput: JitArray,
+        lane: JitArray,
+        active: JitArray,
+        *,
+        first_vertex: bool,
+    ) -> None:
         """Add throughput · f cos · visibility of each of the lane's lights to its samples."""
         import drjit as dr
         import mitsuba as mi
@@ -205,7 +242,7 @@ class PathEstimator:
         start, n_lit, base, n_lanes = (self._word(lane, number) for number in (2, 3, 4, 5))
         mine = base + lane
 
-        def connect(i):
+        def connect(i: JitArray) -> tuple[JitArray]:
             w_light = dr.gather(mi.Vector3f, lights, start + i)
             value = throughput * bsdf.eval(context, interaction, interaction.to_local(w_light), active)
             lit = active & (dr.max(value) > 0)
@@ -223,7 +260,7 @@ class PathEstimator:
 
         dr.while_loop((mi.UInt32(0) + dr.zeros(mi.UInt32, dr.width(lane)),), lambda i: i < n_lit, connect)
 
-    def _statistics(self, pieces):
+    def _statistics(self, pieces: Sequence[Piece]) -> list[tuple[np.ndarray, ...]]:
         """Mean and variance of the mean from the samples of the last pass: two (n_lit, texels, 3) arrays a piece."""
         import drjit as dr
 

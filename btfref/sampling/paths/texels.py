@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from btfref.sampling.paths import estimator
 from btfref.sampling.paths.estimator import PathEstimator, Piece, strata
 from btfref.sampling.tiled_scene import START, stream_words, uniforms
+
+if TYPE_CHECKING:
+    from btfref.types import JitArray
 
 #: Random streams of a texel with a number of samples of its own: more than anybody asks of one texel.
 STREAMS = 1 << 16
@@ -42,8 +46,15 @@ class Request:
     texel: np.ndarray
     lights: np.ndarray | None = None
     counts: np.ndarray | None = None
-    stream: tuple = ()
+    stream: tuple[int, ...] = ()
     tag: Any = None
+
+
+#: A request, its mean and the variance of its mean.
+_Answer: TypeAlias = tuple[Request, np.ndarray, np.ndarray]
+
+#: Texels of a request that share a pass: the request, its results, and which of its texels.
+_Share: TypeAlias = tuple[Request, tuple[np.ndarray, ...], np.ndarray]
 
 
 class TexelPaths(PathEstimator):
@@ -55,17 +66,19 @@ class TexelPaths(PathEstimator):
         Memory (bytes) of the sample buffer of one pass.
     """
 
-    def __init__(self, *args, buffer=None, **settings):
+    def __init__(self, *args: Any, buffer: int | None = None, **settings: Any) -> None:
         super().__init__(*args, **settings)
         self.buffer = buffer
 
     @property
-    def samples_per_pass(self):
+    def samples_per_pass(self) -> int:
         """Pairs of lane and light traced together; a bound on memory, without influence on the result."""
         buffer = min(self.buffer or estimator.SAMPLE_BUFFER, estimator.SAMPLE_BUFFER)
         return max(buffer // 12, 1)
 
-    def estimate(self, view, texel, counts=None, stream=()):
+    def estimate(
+        self, view: int, texel: np.ndarray, counts: np.ndarray | None = None, stream: tuple[int, ...] = ()
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Mean and variance of the mean of some texels of one view for all lights; see `Request`.
 
         Returns
@@ -76,7 +89,7 @@ class TexelPaths(PathEstimator):
         ((_, mean, variance),) = self.estimate_all([Request(view, texel, None, counts, stream)])
         return mean, variance
 
-    def estimate_all(self, requests):
+    def estimate_all(self, requests: Iterable[Request]) -> Iterator[_Answer]:
         """Results of requests in their order; those of few lights share passes.
 
         Parameters
@@ -89,12 +102,14 @@ class TexelPaths(PathEstimator):
         request, mean, variance : Request, ndarray, ndarray
             As of `estimate`, of the request's lights.
         """
-        held, parts, free = [], [], self.samples_per_pass
+        held: list[_Answer] = []
+        parts: list[_Share] = []
+        free = self.samples_per_pass
         for request in requests:
             n_lights = len(self.lights) if request.lights is None else len(request.lights)
             # Mean and variance, to which passes add what they find.
-            results = [np.zeros((n_lights, len(request.texel), 3), np.float32) for _ in range(2)]
-            held.append((request, *results))
+            results = tuple(np.zeros((n_lights, len(request.texel), 3), np.float32) for _ in range(2))
+            held.append((request, results[0], results[1]))
             for texels, cost in self._pieces(request):
                 if parts and (cost > free or request.counts is not None):
                     self._pass(parts)
@@ -114,12 +129,12 @@ class TexelPaths(PathEstimator):
             self._pass(parts)
         yield from held
 
-    def _lit(self, request):
+    def _lit(self, request: Request) -> np.ndarray:
         """Which of the request's lights are above the horizon."""
         vectors = self.lights if request.lights is None else self.lights[request.lights]
         return np.flatnonzero(vectors[:, 2] > 0)
 
-    def _pieces(self, request):
+    def _pieces(self, request: Request) -> Iterator[tuple[np.ndarray, int]]:
         """Places of a request's texels that go together, and what they take of a pass."""
         n_lit = len(self._lit(request))
         if self.views[request.view][2] <= 0 or not n_lit or not len(request.texel):
@@ -133,28 +148,29 @@ class TexelPaths(PathEstimator):
         lanes = max(self.samples_per_pass // each, 1)
         first = 0
         while first < len(order):
-            start = ends[first - 1] if first else 0
-            last = max(np.searchsorted(ends, start + lanes, side="right"), first + 1)
-            yield order[first:last], int(ends[last - 1] - start) * each
+            start = int(ends[first - 1]) if first else 0
+            last = max(int(np.searchsorted(ends, start + lanes, side="right")), first + 1)
+            yield order[first:last], (int(ends[last - 1]) - start) * each
             first = last
 
-    def all_views(self, views):
+    def all_views(self, views: Iterable[int]) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         """Yield (view, mean, variance) of views: (n_lights, rows, columns, 3) float32, B in 1/sr."""
         n_texels = self.texels[0] * self.texels[1]
         texel = np.arange(n_texels) if self.mask is None else np.flatnonzero(self.mask)
-        for request, *parts in self.estimate_all(Request(int(view), texel) for view in views):
-            full = []
-            for part in parts:
-                whole = np.zeros((len(self.lights), n_texels, 3), np.float32)
-                whole[:, texel] = part
-                full.append(whole.reshape(len(self.lights), *self.texels, 3))
-            yield request.view, *full
 
-    def _pass(self, parts):
+        def full(part: np.ndarray) -> np.ndarray:
+            whole = np.zeros((len(self.lights), n_texels, 3), np.float32)
+            whole[:, texel] = part
+            return whole.reshape(len(self.lights), *self.texels, 3)
+
+        for request, mean, variance in self.estimate_all(Request(int(view), texel) for view in views):
+            yield request.view, full(mean), full(variance)
+
+    def _pass(self, parts: Sequence[_Share]) -> None:
         """Trace all samples of some requests' texels and write them to their results."""
         import mitsuba as mi
 
-        pieces, texel, counts, stride = [], [], [], []
+        pieces, each = [], []
         for request, _, place in parts:
             own = request.counts is not None
             n = np.asarray(request.counts)[place] if own else np.full(len(place), self.spp)
@@ -167,10 +183,9 @@ class TexelPaths(PathEstimator):
                     int(n.sum()),
                 )
             )
-            texel.append(np.asarray(request.texel)[place])
-            counts.append(n)
-            stride.append(np.full(len(place), STREAMS if own else self.spp, np.uint64))
-        texel, counts, stride = (np.concatenate(a) for a in (texel, counts, stride))
+            stride = np.full(len(place), STREAMS if own else self.spp, np.uint64)
+            each.append((np.asarray(request.texel)[place], n, stride))
+        texel, counts, stride = (np.concatenate(a) for a in zip(*each, strict=True))
         sample = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
         different, which = np.unique(counts, return_inverse=True)
         split = np.array([strata(int(n)) for n in different], np.uint32)[which]
@@ -188,12 +203,12 @@ class TexelPaths(PathEstimator):
             for result, values in zip(results, some, strict=True):
                 result[np.ix_(self._lit(request), place)] = values
 
-    def _stream(self, lane):
+    def _stream(self, lane: JitArray) -> JitArray:
         import drjit as dr
 
         return dr.gather(type(lane), self._lane, lane)
 
-    def _footprint(self, lane, keys, w_view):
+    def _footprint(self, lane: JitArray, keys: Sequence[JitArray], w_view: JitArray) -> JitArray:
         """Start of the view rays: a stratified point of the lane's texel square, moved up along w_view."""
         import drjit as dr
         import mitsuba as mi
@@ -209,7 +224,7 @@ class TexelPaths(PathEstimator):
         y = (mi.Float(texel // self.texels[1]) + v) / self.texels[0]
         return dr.fma(mi.Vector3f(w_view), START, mi.Point3f(x, y, 0))
 
-    def _sums(self, piece, counts):
+    def _sums(self, piece: Piece, counts: np.ndarray) -> tuple[np.ndarray, ...]:
         """Mean and variance of the mean of blocks of samples; `counts` ascends."""
         import drjit as dr
 

@@ -34,11 +34,16 @@ import json
 import os
 import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.conventions import AXES, COLOUR_SPACE, COSINE_CONVENTION, SCHEMA_VERSION, UNITS
 from btfref.errors import InputError
+
+if TYPE_CHECKING:
+    from btfref.numerics.sphere.directions import DirectionSet
+    from btfref.types import Facts, PathLike
 
 #: Texels along one side of an inner chunk.
 TILE = 64
@@ -65,7 +70,7 @@ CONVENTIONS = {
 DRAFT = ".partial"
 
 
-def attributes_of(path):
+def attributes_of(path: PathLike) -> Facts:
     """Attributes of a store, read from its header alone.
 
     Parameters
@@ -117,7 +122,7 @@ def attributes_of(path):
     return attributes
 
 
-def shard_shape(n_lights, texels, tile):
+def shard_shape(n_lights: int, texels: tuple[int, int], tile: tuple[int, int]) -> tuple[int, int, int]:
     """Lights, tile rows and tile columns of one shard.
 
     Parameters
@@ -141,11 +146,22 @@ def shard_shape(n_lights, texels, tile):
     return lights, rows, columns
 
 
-def write_headers(path, views, lights, texels, dtype, variance, tile, attributes, adaptive=False):
+def write_headers(
+    path: PathLike,
+    views: DirectionSet,
+    lights: DirectionSet,
+    texels: tuple[int, int],
+    dtype: str,
+    variance: bool,
+    tile: int,
+    attributes: Facts | None,
+    adaptive: bool = False,
+) -> None:
     """Lay out an empty store; arguments as of `btfref.sampling.store.store.create_store`."""
     if dtype not in ("float16", "float32"):
         raise InputError("type of the values", field="dtype", got=repr(dtype), expected="float16 or float32")
     import zarr
+    from zarr.codecs import Crc32cCodec
 
     rows, columns = texels
     n_views, n_lights = len(views), len(lights)
@@ -170,7 +186,7 @@ def write_headers(path, views, lights, texels, dtype, variance, tile, attributes
             chunks=(1, 1, tile_rows, tile_columns, 3),
             # A shard holds whole inner chunks, so it may reach beyond the last row and column.
             shards=(1, shard[0], shard[1] * tile_rows, shard[2] * tile_columns, 3),
-            compressors=zarr.codecs.Crc32cCodec(),
+            compressors=Crc32cCodec(),
             fill_value=float("nan"),
             dimension_names=list(AXES),
         )
@@ -179,7 +195,7 @@ def write_headers(path, views, lights, texels, dtype, variance, tile, attributes
         shape=(n_views, n_lights, *n_tiles),
         dtype="uint8",
         chunks=(1, n_lights, *n_tiles),
-        compressors=zarr.codecs.Crc32cCodec(),
+        compressors=Crc32cCodec(),
         fill_value=0,
         dimension_names=["view", "light", "tile_row", "tile_column"],
     )
@@ -196,7 +212,7 @@ def write_headers(path, views, lights, texels, dtype, variance, tile, attributes
             shape=(n_views, rows, columns, *last),
             dtype=kind,
             chunks=(1, rows, columns, *last),
-            compressors=zarr.codecs.Crc32cCodec(),
+            compressors=Crc32cCodec(),
             fill_value=float("nan") if kind == "float32" else 0,
         )
     for name, vectors in (("views", views.vectors), ("lights", lights.vectors)):
@@ -204,13 +220,13 @@ def write_headers(path, views, lights, texels, dtype, variance, tile, attributes
             name,
             shape=vectors.shape,
             dtype="float64",
-            compressors=zarr.codecs.Crc32cCodec(),
+            compressors=Crc32cCodec(),
             fill_value=float("nan"),
         )
         array[:] = vectors
 
 
-def remove_leftovers(path):
+def remove_leftovers(path: PathLike) -> None:
     """Remove what killed runs left: drafts beside a store and temporary files inside it.
 
     Parameters
@@ -232,7 +248,7 @@ def remove_leftovers(path):
             leftover.unlink(missing_ok=True)
 
 
-def replace_store(draft, path):
+def replace_store(draft: PathLike, path: PathLike) -> None:
     """Give a finished store its name, in place of an older *store* of that name; other things are kept.
 
     Parameters
@@ -250,7 +266,7 @@ def replace_store(draft, path):
     os.rename(draft, path)
 
 
-def remove_store(path):
+def remove_store(path: PathLike) -> None:
     """Remove a sampled BTF; refuses anything that is not one.
 
     Parameters
@@ -273,7 +289,7 @@ def remove_store(path):
     shutil.rmtree(removed)
 
 
-def check_finite(values, path, field):
+def check_finite(values: np.ndarray, path: PathLike | None, field: str) -> None:
     """InputError with the place of the first value that is NaN or infinite."""
     # Slab by slab: a full boolean copy of a large BTF would not be small.
     for index, slab in enumerate(values):

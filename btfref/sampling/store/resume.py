@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
 from btfref.errors import InputError
 from btfref.sampling.store.layout import remove_store
 from btfref.sampling.store.store import open_store
 
+if TYPE_CHECKING:
+    from btfref.numerics.sphere.directions import DirectionSet
+    from btfref.sampling.store.store import BTFStore
+    from btfref.types import Facts
 
-def resumable(out, views, lights, attributes, overwrite):
+
+def resumable(
+    out: Path, views: DirectionSet, lights: DirectionSet, attributes: Facts, overwrite: bool
+) -> BTFStore | None:
     """The store at ``out`` when it has these directions and attributes.
 
     Parameters
@@ -67,7 +77,7 @@ def resumable(out, views, lights, attributes, overwrite):
     return store
 
 
-def _difference(key, found, wanted):
+def _difference(key: str, found: Any, wanted: Any) -> tuple[str, Any, Any]:
     """The first entry in which two settings differ."""
     while isinstance(found, dict) and isinstance(wanted, dict):
         inner = next(name for name in {**wanted, **found} if found.get(name) != wanted.get(name))

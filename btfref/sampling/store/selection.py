@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.errors import InputError
+
+if TYPE_CHECKING:
+    from btfref.sampling.store.store import BTFStore
 
 
 @dataclass(frozen=True)
@@ -23,13 +28,13 @@ class Selection:
         In place of views and lights: views, each once, with the lights that are wanted of them, at least one.
     """
 
-    views: tuple | None = None
-    lights: tuple | None = None
-    tiles: tuple | None = None
-    pairs: tuple | None = None
+    views: Sequence[int] | None = None
+    lights: Sequence[int] | None = None
+    tiles: Sequence[int] | None = None
+    pairs: Sequence[tuple[int, Sequence[int]]] | None = None
 
     @classmethod
-    def of_pairs(cls, pairs, tiles=None):
+    def of_pairs(cls, pairs: np.ndarray, tiles: Iterable[int] | None = None) -> Selection:
         """The part of some pairs; plain views and lights where these are all their pairs.
 
         Parameters
@@ -48,7 +53,7 @@ class Selection:
             return cls(views, lights, tiles)
         return cls(tiles=tiles, pairs=tuple((v, tuple(np.flatnonzero(pairs[v]).tolist())) for v in views))
 
-    def indices(self, store):
+    def indices(self, store: BTFStore) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """What it spans.
 
         Returns
@@ -73,7 +78,7 @@ class Selection:
             (tiles // columns, tiles % columns),
         )
 
-    def wanted(self, store):
+    def wanted(self, store: BTFStore) -> np.ndarray:
         """Pairs that belong to it: (views, lights) bool; errors as of `indices`."""
         n_views, n_lights = len(store.views), len(store.lights)
         result = np.zeros((n_views, n_lights), bool)
@@ -83,14 +88,14 @@ class Selection:
             return result
         if self.views is not None or self.lights is not None:
             raise InputError("part of a BTF", field="pairs", got="views or lights beside", expected="either")
-        views = [view for view, _ in self.pairs]
-        if len(_checked("pairs", views, n_views)) < len(views):
-            raise InputError("part of a BTF", field="pairs", got=views, expected="each view once")
-        for view, lights in self.pairs:
-            result[view, _checked("pairs", lights, n_lights)] = True
+        named = [view for view, _ in self.pairs]
+        if len(_checked("pairs", named, n_views)) < len(named):
+            raise InputError("part of a BTF", field="pairs", got=named, expected="each view once")
+        for view, some in self.pairs:
+            result[view, _checked("pairs", some, n_lights)] = True
         return result
 
-    def mask(self, store):
+    def mask(self, store: BTFStore) -> np.ndarray:
         """Texels of the part's tiles: (rows · columns,) bool."""
         rows, columns = store.texels
         _, _, tiles = self.indices(store)
@@ -100,7 +105,7 @@ class Selection:
         return wanted[np.ix_(row, column)].ravel()
 
 
-def _checked(name, chosen, n):
+def _checked(name: str, chosen: Sequence[int] | None, n: int) -> np.ndarray:
     if chosen is None:
         return np.arange(n)
     index = np.unique(np.asarray(list(chosen), dtype=np.int64)) if len(chosen) else np.zeros(0, np.int64)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -15,10 +17,45 @@ from btfref.outputs import refuse_existing, require_folder_of
 from btfref.sampling.paths.adaptive import summary
 from btfref.sampling.store.layout import DRAFT, KIND, TILE, attributes_of, check_finite, write_headers
 
+if TYPE_CHECKING:
+    from zarr.storage import StoreLike
+
+    from btfref.numerics.sphere.directions import DirectionSet
+    from btfref.types import Facts, PathLike
+
+
+#: What of an axis is read: all, one, a slice, or a list of indices.
+Choice: TypeAlias = "int | slice | Sequence[int] | np.ndarray | None"
+
+_T = TypeVar("_T")
+
+
+class StoredArray(Protocol):
+    """An array on disk, which Zarr's own types say little about: parts of it are NumPy arrays."""
+
+    shape: tuple[int, ...]
+    chunks: tuple[int, ...]
+    shards: tuple[int, ...] | None
+    dtype: np.dtype
+    oindex: Any
+
+    def __getitem__(self, selection: Any, /) -> np.ndarray: ...
+
+    def __setitem__(self, selection: Any, value: np.ndarray, /) -> None: ...
+
 
 def create_store(
-    path, *, views, lights, texels, dtype="float16", variance=True, tile=TILE, attributes=None, adaptive=False
-):
+    path: PathLike,
+    *,
+    views: DirectionSet,
+    lights: DirectionSet,
+    texels: tuple[int, int],
+    dtype: str = "float16",
+    variance: bool = True,
+    tile: int = TILE,
+    attributes: Facts | None = None,
+    adaptive: bool = False,
+) -> BTFStore:
     """An empty store; it appears under its name only when all its headers are there.
 
     Parameters
@@ -59,7 +96,7 @@ def create_store(
     return BTFStore(path)
 
 
-def open_store(path):
+def open_store(path: PathLike) -> BTFStore:
     """Open a store without reading values.
 
     Parameters
@@ -94,7 +131,7 @@ class BTFStore:
     has_variance : bool
     """
 
-    def __init__(self, path, *, store=None):
+    def __init__(self, path: PathLike, *, store: StoreLike | None = None) -> None:
         import zarr
 
         self.path = Path(path)
@@ -109,9 +146,8 @@ class BTFStore:
             self._directions(key, names.get(key, "custom")) for key in ("views", "lights")
         )
         self.dtype = np.dtype(self._values.dtype)
-        self.texels = tuple(self._values.shape[2:4])
         n_views, n_lights, rows, columns, channels = self._values.shape
-        self.tile = tuple(self._values.chunks[2:4])
+        self.texels, self.tile = (rows, columns), (self._values.chunks[2], self._values.chunks[3])
         if (n_views, n_lights, channels) != (len(self.views), len(self.lights), 3) or 0 in (rows, columns):
             raise InputError(
                 "values and directions do not fit",
@@ -124,7 +160,7 @@ class BTFStore:
             raise InputError(
                 "type of the values", file=self.path, field="values", got=self.dtype, expected="float16/32"
             )
-        if self.has_variance and self._variance.shape != self._values.shape:
+        if self._variance is not None and self._variance.shape != self._values.shape:
             raise InputError(
                 "variance and values do not fit", file=self.path, field="variance", got=self._variance.shape
             )
@@ -134,7 +170,7 @@ class BTFStore:
         size = int(np.prod(self._values.shape, dtype=np.int64)) * self.dtype.itemsize
         return in_one_line(kind, self.texels, self.views.facts, self.lights.facts, size)
 
-    def _guard(self, field, action):
+    def _guard(self, field: str, action: Callable[[], _T]) -> _T:
         """Whatever Zarr makes of a damaged file becomes one clear line."""
         try:
             return action()
@@ -143,27 +179,27 @@ class BTFStore:
         except Exception as error:
             raise InputError("damaged store", file=self.path, field=field, got=error) from error
 
-    def _array(self, name, ndim):
-        array = self._guard(name, lambda: self._group[name])
+    def _array(self, name: str, ndim: int) -> StoredArray:
+        array = cast("StoredArray", self._guard(name, lambda: self._group[name]))
         if getattr(array, "ndim", None) != ndim:
             raise InputError("damaged store", file=self.path, field=name, expected=f"an array of {ndim} axes")
         return array
 
-    def _directions(self, name, spec):
+    def _directions(self, name: str, spec: str) -> DirectionSet:
         array = self._array(name, 2)
         return checked(self._guard(name, lambda: array[:]), spec, file=self.path)
 
     @property
-    def coverage(self):
+    def coverage(self) -> np.ndarray:
         """Which parts are there: bool, shape (views, lights, tile rows, tile columns)."""
         return self._guard("coverage", lambda: self._coverage[:]) == 1
 
     @property
-    def complete(self):
+    def complete(self) -> bool:
         """Whether every view, light and tile is there."""
         return bool(self.coverage.all())
 
-    def info(self):
+    def info(self) -> Facts:
         """Header facts, without reading values.
 
         Returns
@@ -207,25 +243,41 @@ class BTFStore:
         }
 
     @property
-    def shard(self):
+    def shard(self) -> tuple[int, int]:
         """Tile rows and tile columns that one file holds."""
         shards = self._values.shards
         sides = (shards or self._values.chunks)[2:4]
-        return tuple(n // size for n, size in zip(sides, self.tile, strict=True))
+        return sides[0] // self.tile[0], sides[1] // self.tile[1]
 
-    def covered(self, view):
+    def covered(self, view: int) -> np.ndarray:
         """Which parts of a view are there: bool, shape (lights, tile rows, tile columns)."""
         return self._guard("coverage", lambda: self._coverage[int(view)]) == 1
 
-    def write_map(self, name, view, values):
+    def write_map(self, name: str, view: int, values: np.ndarray) -> None:
         """Write a view of an array that `maps` gives."""
-        self._guard(name, lambda: self.maps(name).__setitem__(int(view), values))
+        self._guard(name, lambda: self._map(name).__setitem__(int(view), values))
 
-    def maps(self, name):
+    def maps(self, name: str) -> StoredArray | None:
         """The Zarr array "pilot", "samples" or "reached" of a store made to a target error, else None."""
-        return self._group[name] if name in self._group else None
+        return cast("StoredArray", self._group[name]) if name in self._group else None
 
-    def write_view(self, view, values, variance=None):
+    def read_map(self, name: str, view: int) -> np.ndarray:
+        """A view of an array that `maps` gives.
+
+        Raises
+        ------
+        InputError
+            A store that was not made to a target error.
+        """
+        return self._guard(name, lambda: self._map(name)[int(view)])
+
+    def _map(self, name: str) -> StoredArray:
+        array = self.maps(name)
+        if array is None:
+            raise InputError("not made to a target error", file=self.path, field=name)
+        return array
+
+    def write_view(self, view: int, values: np.ndarray, variance: np.ndarray | None = None) -> None:
         """Store one view; it counts as there only when all of it is on disk.
 
         Parameters
@@ -245,11 +297,21 @@ class BTFStore:
         self.write_part(view, np.arange(len(self.lights)), tiles, values, variance)
 
     @property
-    def coverage_shape(self):
+    def coverage_shape(self) -> tuple[int, int]:
         """Tile rows and tile columns of the whole."""
-        return tuple(self._coverage.shape[2:])
+        rows, columns = self._coverage.shape[2:]
+        return rows, columns
 
-    def write_part(self, view, lights, tiles, values, variance=None, *, origin=(0, 0)):
+    def write_part(
+        self,
+        view: int,
+        lights: np.ndarray,
+        tiles: tuple[np.ndarray, np.ndarray],
+        values: np.ndarray,
+        variance: np.ndarray | None = None,
+        *,
+        origin: tuple[int, int] = (0, 0),
+    ) -> None:
         """Store some tiles of some lights of one view; errors as of `write_view`.
 
         Parameters
@@ -267,14 +329,14 @@ class BTFStore:
             raise InputError(
                 "variance of a view", file=self.path, expected="given" if self.has_variance else "none"
             )
-        tiles = np.stack(tiles, 1)
+        places = np.stack(tiles, 1)
         end = [min(n, (last + 1) * t) - o for n, last, t, o in zip(
-            self.texels, tiles.max(0), self.tile, origin, strict=True)]  # fmt: skip
+            self.texels, places.max(0), self.tile, origin, strict=True)]  # fmt: skip
         for field, array, target in (
             ("values", values, self._values),
             ("variance", variance, self._variance),
         ):
-            if array is None:
+            if array is None or target is None:
                 continue
             shape = (len(lights), *array.shape[1:3], 3)
             if array.shape != shape or array.shape[1] < end[0] or array.shape[2] < end[1]:
@@ -282,15 +344,25 @@ class BTFStore:
                 raise InputError(
                     "wrong shape", file=self.path, field=field, got=array.shape, expected=expected
                 )
-            for shard in np.unique(tiles // self.shard, axis=0):
-                inside = tiles[(tiles // self.shard == shard).all(1)]
+            for shard in np.unique(places // self.shard, axis=0):
+                inside = places[(places // self.shard == shard).all(1)]
                 self._write_shard(target, field, int(view), lights, inside, shard, array, origin)
         marks = self._guard("coverage", lambda: self._coverage[int(view)])
-        for row, column in tiles:
+        for row, column in places:
             marks[lights, row, column] = 1
         self._guard("coverage", lambda: self._coverage.__setitem__(int(view), marks))
 
-    def _write_shard(self, target, field, view, lights, tiles, shard, array, origin):
+    def _write_shard(
+        self,
+        target: StoredArray,
+        field: str,
+        view: int,
+        lights: np.ndarray,
+        tiles: np.ndarray,
+        shard: np.ndarray,
+        array: np.ndarray,
+        origin: tuple[int, int],
+    ) -> None:
         """Write tiles of one shard; what the file has beside them is kept."""
         rows, columns = (
             slice(k * s * t, min((k + 1) * s * t, n))
@@ -305,7 +377,7 @@ class BTFStore:
         ]
         whole = len(lights) == span.stop - span.start and len(tiles) == n_tiles[0] * n_tiles[1]
 
-        def given(texel_rows, texel_columns):
+        def given(texel_rows: slice, texel_columns: slice) -> np.ndarray:
             part = array[
                 :,
                 texel_rows.start - origin[0] : texel_rows.stop - origin[0],
@@ -333,7 +405,15 @@ class BTFStore:
                 block[lights - span.start, there[0], there[1]] = given(*texels)
         self._guard(field, lambda: target.__setitem__(place, block))
 
-    def read(self, *, views=None, lights=None, rows=None, columns=None, variance=True):
+    def read(
+        self,
+        *,
+        views: Choice = None,
+        lights: Choice = None,
+        rows: Choice = None,
+        columns: Choice = None,
+        variance: bool = True,
+    ) -> tuple[np.ndarray, np.ndarray | None]:
         """Read a part; only the chunks that hold it are touched.
 
         Parameters
@@ -355,10 +435,10 @@ class BTFStore:
             not finite.
         """
         lengths = self._values.shape[:4]
-        wanted = zip(
+        axes = zip(
             ("views", "lights", "rows", "columns"), (views, lights, rows, columns), lengths, strict=True
         )
-        selection = [_selection(name, index, n) for name, index, n in wanted]
+        selection = [_selection(name, index, n) for name, index, n in axes]
         indices = [np.arange(n)[chosen] for chosen, n in zip(selection, lengths, strict=True)]
         tiles = [np.unique(index // size) for index, size in zip(indices[2:], self.tile, strict=True)]
         covered = self.coverage[np.ix_(indices[0], indices[1], *tiles)]
@@ -371,11 +451,10 @@ class BTFStore:
                 expected="all",
             )
         values = self._read("values", self._values, selection)
-        return values, self._read(
-            "variance", self._variance, selection
-        ) if variance and self.has_variance else None
+        wanted = self._variance if variance else None
+        return values, None if wanted is None else self._read("variance", wanted, selection)
 
-    def _read(self, field, array, selection):
+    def _read(self, field: str, array: StoredArray, selection: Sequence[slice | np.ndarray]) -> np.ndarray:
         selection = (*selection, slice(None))
         if all(isinstance(part, slice) for part in selection):
             values = self._guard(field, lambda: array[selection])
@@ -389,7 +468,7 @@ class BTFStore:
         return values
 
 
-def _selection(name, index, n):
+def _selection(name: str, index: Choice, n: int) -> slice | np.ndarray:
     """An index as a slice where it is one (Zarr reads slices much faster), else as an array of int."""
     if index is None:
         return slice(None)

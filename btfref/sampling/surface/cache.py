@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from btfref.numerics.device_arrays import to_device
+
+if TYPE_CHECKING:
+    from btfref.sampling.surface.lobes import BroadLobes
+    from btfref.sampling.surface.triangles import Descent
+    from btfref.sampling.tiled_scene import TiledScene
+    from btfref.types import JitArray
 
 #: Of the directions that a vertex looks at, one in so many is traced; the others are looked up.
 SHARE = 8
@@ -30,7 +38,9 @@ class VisibilityCache:
     directions : ndarray (n_directions, 3)
     """
 
-    def __init__(self, bits, descent, lobes, directions):
+    def __init__(
+        self, bits: np.ndarray | None, descent: Descent, lobes: BroadLobes, directions: np.ndarray
+    ) -> None:
         import mitsuba as mi
 
         self.n = len(directions)
@@ -54,7 +64,7 @@ class VisibilityCache:
         self._members, self._starts = (to_device(mi.UInt32, words) for words in (order, starts))
         self.vectors = to_device(mi.Float, directions)
 
-    def row(self, hit, number):
+    def row(self, hit: JitArray, number: JitArray) -> JitArray:
         """Small triangle of preliminary intersections (`mitsuba.PreliminaryIntersection3f`)."""
         import drjit as dr
         import mitsuba as mi
@@ -82,7 +92,15 @@ class VisibilityCache:
         first = dr.gather(mi.UInt32, self._first, face, found)
         return dr.gather(mi.UInt32, self._row, first + code, found)
 
-    def sights(self, tiles, si, row, choice, *, towards=None):
+    def sights(
+        self,
+        tiles: TiledScene,
+        si: JitArray,
+        row: JitArray,
+        choice: JitArray,
+        *,
+        towards: JitArray | None = None,
+    ) -> JitArray:
         """Visibility of all directions from surface interactions.
 
         Parameters
@@ -118,7 +136,7 @@ class VisibilityCache:
         side = None if towards is None else dr.dot(si.sh_frame.n, towards)
 
         # Stored with 128 added where traced: V and C are one bit each.
-        def look(i):
+        def look(i: JitArray) -> tuple[JitArray]:
             direction = dr.gather(mi.UInt32, self._members, i)
             w = dr.gather(mi.Vector3f, self.vectors, direction)
             active = mi.Bool(True) if side is None else side * dr.dot(si.sh_frame.n, w) > 0
@@ -136,7 +154,7 @@ class VisibilityCache:
         dr.eval(result)
         return result
 
-    def value(self, coded):
+    def value(self, coded: JitArray) -> JitArray:
         """Visibility as a number from its code: 0 or 1, or ``C + share (V − C)`` where it was traced."""
         import drjit as dr
         import mitsuba as mi

@@ -25,8 +25,9 @@ neighbouring views and all lights see the same points and walks.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -40,6 +41,12 @@ from btfref.sampling.surface.texels import TOGETHER, TexelWalks, lanes
 from btfref.sampling.surface.triangles import density, triangles
 from btfref.sampling.surface.walks import Lights, Surface, continue_walks, visibility
 from btfref.sampling.tiled_scene import START, TiledScene, rotated, stream_keys, uniforms
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from btfref.mesostructure.base import Mesostructure
+    from btfref.types import JitArray
 
 #: View rays of a half whose other half finds a texel empty.
 RAYS = 2
@@ -82,7 +89,7 @@ class SurfaceScene:
 BROAD_WALKS = 8
 
 
-def walks(spp):
+def walks(spp: int) -> tuple[int, int]:
     """Walks per point, and per texel, direction and half.
 
     Five points per walk of a half: on tissue and rings direct light and light by way of the rest are then about
@@ -127,24 +134,36 @@ class SurfaceEstimator:
     key = "surface"
 
     def __init__(
-        self, mesostructure, lights, *, views, texels, spp, seed, max_depth, wanted=None, mask=None,
-        chosen=None, variance=True,
-    ):  # fmt: skip
+        self,
+        mesostructure: Mesostructure,
+        lights: ArrayLike,
+        *,
+        views: ArrayLike,
+        texels: Sequence[int],
+        spp: int,
+        seed: int,
+        max_depth: int,
+        wanted: ArrayLike | None = None,
+        mask: np.ndarray | None = None,
+        chosen: ArrayLike | None = None,
+        variance: bool = True,
+    ) -> None:
         import mitsuba as mi
 
-        self.texels, self.spp, self.seed = tuple(texels), int(spp), int(seed)
+        rows, columns = texels
+        self.texels, self.spp, self.seed = (int(rows), int(columns)), int(spp), int(seed)
         self.mask, self.variance = mask, variance
-        self.n_texels = texels[0] * texels[1]
-        views, lights = np.asarray(views, np.float64), np.asarray(lights, np.float64)
-        wanted = np.arange(len(views)) if wanted is None else np.asarray(wanted)
+        self.n_texels = rows * columns
+        views, every = np.asarray(views, np.float64), np.asarray(lights, np.float64)
+        asked = np.arange(len(views)) if wanted is None else np.asarray(wanted)
         # The patch is that of all directions: rays that are wrapped elsewhere round otherwise.
-        ways = np.concatenate([views, lights])
-        lights = lights if chosen is None else lights[np.asarray(chosen)]
-        self.n_lights = len(lights)
-        self.lit = np.flatnonzero(lights[:, 2] > 0)
-        self.wanted = wanted[views[wanted, 2] > 0]
+        ways = np.concatenate([views, every])
+        own = every if chosen is None else every[np.asarray(chosen)]
+        self.n_lights = len(own)
+        self.lit = np.flatnonzero(own[:, 2] > 0)
+        self.wanted = asked[views[asked, 2] > 0]
         # Equal directions of views and lights are one direction.
-        vectors = np.concatenate([views[self.wanted], lights[self.lit]]).astype(np.float32)
+        vectors = np.concatenate([views[self.wanted], own[self.lit]]).astype(np.float32)
         _, first, index = np.unique(np.round(vectors, 6), axis=0, return_index=True, return_inverse=True)
         directions = vectors[first].astype(np.float64)
         index = index.ravel()
@@ -155,11 +174,11 @@ class SurfaceEstimator:
         if not len(directions) or not len(self.lit):
             return
         tiles = TiledScene(mesostructure, ways)
-        lights = Lights(to_device(mi.Float, lights[self.lit]), to_device(mi.UInt32, light_rows))
-        self.scene = SurfaceScene(tiles, BroadLobes(tiles.bsdfs), directions, lights)
+        there = Lights(to_device(mi.Float, own[self.lit]), to_device(mi.UInt32, light_rows))
+        self.scene = SurfaceScene(tiles, BroadLobes(tiles.bsdfs), directions, there)
         self._place_points(mesostructure, views)
         self._see()
-        self.walks = None
+        self.walks: TexelWalks | None = None
         if self.n_vertices >= 2:
             self.walks = TexelWalks(
                 self.scene, self.surface, self.bins, per_half=self.rest_walks,
@@ -169,7 +188,7 @@ class SurfaceEstimator:
 
     # --- points and what they see
 
-    def _place_points(self, mesostructure, views):
+    def _place_points(self, mesostructure: Mesostructure, views: np.ndarray) -> None:
         """Points where views look, and the visibility of small triangles."""
         scene = self.scene
         pieces, descent = triangles(mesostructure, 1.0 / self.n_texels)
@@ -192,7 +211,7 @@ class SurfaceEstimator:
         share = density(pieces, pilots, front, varied)
         self.points = sample_points(pieces, share, count, np.random.default_rng([self.seed, _POINTS]))
 
-    def _see(self):
+    def _see(self) -> None:
         """Visibility of all points along all directions, bins of all directions, rays for empty texels."""
         scene, n_texels = self.scene, self.n_texels
         n_points = len(self.points.p)
@@ -237,7 +256,7 @@ class SurfaceEstimator:
         self.used = used
         self._light_table(seen[scene.lights.rows.numpy()], sights)
 
-    def _view_rays(self, rays):
+    def _view_rays(self, rays: list[np.ndarray]) -> tuple[Surface, np.ndarray, JitArray]:
         """First hits of rays through texels of several directions: records, streams, what they see.
 
         Misses are the absorber.
@@ -260,7 +279,7 @@ class SurfaceEstimator:
         si, *_ = found.interaction(None)
         return found, lane.numpy(), self.scene.cache.sights(self.scene.tiles, si, row, choice, towards=w)
 
-    def _light_table(self, seen, sights):
+    def _light_table(self, seen: np.ndarray, sights: JitArray | None) -> None:
         """Per record and light: three sums of light by way of the broad lobe, and the visibility.
 
         ``seen`` [light, point] tells that of points, ``sights`` [ray, direction] that of view rays. Direct light
@@ -272,7 +291,7 @@ class SurfaceEstimator:
         n_points, n_lit, cache, lobes = seen.shape[1], len(self.lit), self.scene.cache, self.scene.lobes
         self.table = dr.zeros(mi.Float, len(self.stream) * n_lit * 4)
 
-        def fill(lane, record, sees):
+        def fill(lane: JitArray, record: JitArray, sees: JitArray) -> None:
             light = lane % n_lit
             if lobes.exact:
                 _, _, number, albedo = self.surface.interaction(record)
@@ -283,7 +302,7 @@ class SurfaceEstimator:
                 direct = mi.Color3f(0)
             values = (*direct, sees)
 
-            def write():
+            def write() -> None:
                 for k, value in enumerate(values):
                     dr.scatter(self.table, value, (record * n_lit + light) * 4 + k)
 
@@ -301,7 +320,7 @@ class SurfaceEstimator:
 
     # --- walks
 
-    def _walk_from_points(self):
+    def _walk_from_points(self) -> None:
         """Light by way of the broad lobe at the points: cosine-distributed walks, the same for all views."""
         import drjit as dr
         import mitsuba as mi
@@ -342,11 +361,11 @@ class SurfaceEstimator:
 
     # --- results
 
-    def view(self, index, w_view=None):
+    def view(self, index: int, w_view: object = None) -> tuple[np.ndarray, np.ndarray | None]:
         """Mean and variance of the mean for one view; see `PathEstimator.view`."""
         return next(self.all_views([index]))[1:]
 
-    def all_views(self, views):
+    def all_views(self, views: Iterable[int]) -> Iterator[tuple[int, np.ndarray, np.ndarray | None]]:
         """Results of views in the order given.
 
         Yields
@@ -359,7 +378,8 @@ class SurfaceEstimator:
         each = self.n_texels * max(len(self.lit), 1) * 12
         together = max(1, min(GATHER_BUFFER // each, (2**31 - 1) * 2 // each))
         live = [view for view in views if view in self.row and len(self.lit)]
-        held, done = {}, 0
+        held: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
+        done = 0
         for view in views:
             if view not in self.row or not len(self.lit):
                 zero = np.zeros((self.n_lights, *self.texels, 3), np.float32)
@@ -372,12 +392,13 @@ class SurfaceEstimator:
                     one: (mean[k], None if variance is None else variance[k]) for k, one in enumerate(now)
                 }
             done += 1
-            yield view, *(None if part is None else self._all_lights(part) for part in held[view])
+            one, spread = held[view]
+            yield view, self._all_lights(one), None if spread is None else self._all_lights(spread)
 
-    def _results(self, views):
+    def _results(self, views: Sequence[int]) -> tuple[np.ndarray, np.ndarray | None]:
         """Means and variances of several views: (views, lights above the horizon, texels, 3) each."""
         rows = [self.row[view] for view in views]
-        walks = self.walks if self.walks is not None and self.walks.hits is not None else None
+        walks = self.walks if self.walks is not None and self.walks.hits else None
         return gather(
             self.scene, self.surface, self.table, rows, [self.bins[k] for k in rows],
             radiance=None if walks is None else walks.radiance(rows),
@@ -385,7 +406,7 @@ class SurfaceEstimator:
             texels=self.texels, variance=self.variance,
         )  # fmt: skip
 
-    def _all_lights(self, part):
+    def _all_lights(self, part: np.ndarray) -> np.ndarray:
         """With black images for lights below the horizon: (lights, rows, columns, 3)."""
         if len(self.lit) < self.n_lights:
             full = np.zeros((self.n_lights, self.n_texels, 3), np.float32)

@@ -8,10 +8,19 @@ about as quiet as the ratio Σ w L / Σ w. It equals ``½ [R_0 (1 + W_0 − W_1)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from btfref.numerics.device_arrays import in_one_kernel, packed, to_device, unpacked
 from btfref.sampling.surface.points import starts
+
+if TYPE_CHECKING:
+    from btfref.sampling.surface.estimator import SurfaceScene
+    from btfref.sampling.surface.points import Bins
+    from btfref.sampling.surface.walks import Surface
+    from btfref.types import JitArray
 
 #: Lights that one lane serves.
 LIGHTS_PER_LANE = 3
@@ -20,7 +29,18 @@ LIGHTS_PER_LANE = 3
 LEAST_FREEDOM = 4
 
 
-def gather(scene, surface, table, rows, bins, *, radiance, splats, texels, variance=True):
+def gather(
+    scene: SurfaceScene,
+    surface: Surface,
+    table: JitArray,
+    rows: Sequence[int],
+    bins: list[Bins],
+    *,
+    radiance: JitArray | None,
+    splats: list[JitArray] | None,
+    texels: tuple[int, int],
+    variance: bool = True,
+) -> tuple[np.ndarray, np.ndarray | None]:
     """Means and variances of the mean of several views.
 
     Parameters
@@ -69,22 +89,23 @@ def gather(scene, surface, table, rows, bins, *, radiance, splats, texels, varia
     points, spread = _points(scene, surface, table, rows, bins, cell, first, variance)
     drafts = [dr.empty(mi.Float, int(np.prod(shape))) for _ in range(1 + variance)]
     mine = dr.gather(mi.Float, share, cell)
+    pooled = None
     if variance and radiance is not None:
         pooled = _pooled(radiance, len(rows), texels, n_lit)
         block = (texel // texels[1] // 2) * ((texels[1] + 1) // 2) + texel % texels[1] // 2
         block += view * (((texels[0] + 1) // 2) * ((texels[1] + 1) // 2))
 
-    def write():
+    def write() -> None:
         for j in range(LIGHTS_PER_LANE):
             light = first + j
             inside = light < n_lit
-            results = [points[j], *([spread[j]] if variance else [])]
+            results = [points[j]] if spread is None else [points[j], spread[j]]
             if radiance is not None:
                 at = (2 * view * n_texels + texel) * n_lit + light
                 one = dr.gather(mi.Color3f, radiance, at, inside)
                 other = dr.gather(mi.Color3f, radiance, at + n_texels * n_lit, inside)
                 results[0] += mine * one + (1 - mine) * other
-                if variance:
+                if pooled is not None:
                     # The halves' shares are mine and 1 − mine, the pooled number is for ½ and ½.
                     scale = 2 * (dr.square(mine) + dr.square(1 - mine))
                     results[1] += scale * dr.gather(mi.Color3f, pooled, block * n_lit + light, inside)
@@ -102,7 +123,7 @@ def gather(scene, surface, table, rows, bins, *, radiance, splats, texels, varia
     return made[0], made[1] if variance else None
 
 
-def _order(bins):
+def _order(bins: list[Bins]) -> np.ndarray:
     """Cells of several bins in the order of their first records: neighbours read the same rows of the table."""
     offsets = np.cumsum([0, *(len(some.record) for some in bins[:-1])])
     record = np.concatenate([*(some.record for some in bins), [0]])
@@ -110,7 +131,7 @@ def _order(bins):
     return np.argsort(record[np.minimum(first, len(record) - 1)], kind="stable")
 
 
-def _turned(draft, shape, target):
+def _turned(draft: JitArray, shape: tuple[int, int, int, int], target: JitArray | None) -> JitArray:
     """From [view, texel, light, 3], as lanes make them, to [view, light, texel, 3], added to a target if any."""
     import drjit as dr
     import mitsuba as mi
@@ -130,7 +151,7 @@ def _turned(draft, shape, target):
     else:
         value += dr.gather(mi.Color3f, target, at)
 
-    def write():
+    def write() -> None:
         for channel in range(3):
             dr.scatter(target, value[channel], 3 * at + channel)
 
@@ -139,7 +160,7 @@ def _turned(draft, shape, target):
     return target
 
 
-def _pooled(radiance, n_views, texels, n_lit):
+def _pooled(radiance: JitArray, n_views: int, texels: tuple[int, int], n_lit: int) -> JitArray:
     """Variance of the halves' mean over two by two texels: [view, block, light, 3]."""
     import drjit as dr
     import mitsuba as mi
@@ -158,7 +179,7 @@ def _pooled(radiance, n_views, texels, n_lit):
             total += dr.square(one - dr.gather(mi.Color3f, radiance, at + n_texels * n_lit))
     result = dr.zeros(mi.Float, 3 * dr.width(lane))
 
-    def write():
+    def write() -> None:
         for channel in range(3):
             dr.scatter(result, total[channel] / 16, 3 * lane + channel)
 
@@ -167,7 +188,7 @@ def _pooled(radiance, n_views, texels, n_lit):
     return result
 
 
-def _packets(scene, surface, rows, bins):
+def _packets(scene: SurfaceScene, surface: Surface, rows: Sequence[int], bins: list[Bins]) -> JitArray:
     """What the loop needs to know of an entry, 16 numbers each: computed once, not once per light."""
     import drjit as dr
     import mitsuba as mi
@@ -186,7 +207,16 @@ def _packets(scene, surface, rows, bins):
     return packed([*s, uv.x, *shading, uv.y, *wi, shape, part, numbers, records, weight])
 
 
-def _points(scene, surface, table, rows, bins, cell, first, variance):
+def _points(
+    scene: SurfaceScene,
+    surface: Surface,
+    table: JitArray,
+    rows: Sequence[int],
+    bins: list[Bins],
+    cell: JitArray,
+    first: JitArray,
+    variance: bool,
+) -> tuple[list[JitArray], list[JitArray] | None]:
     """Mean and its variance from the entries: per light of a lane's block one colour each."""
     import drjit as dr
     import mitsuba as mi
@@ -199,7 +229,7 @@ def _points(scene, surface, table, rows, bins, cell, first, variance):
     width = dr.width(cell)
     zero = dr.zeros(mi.Float, width)
     if n_entries == 0:
-        return [[mi.Color3f(zero) for _ in range(block)] for _ in range(2)]
+        return [mi.Color3f(zero) for _ in range(block)], [mi.Color3f(zero) for _ in range(block)]
     packets = _packets(scene, surface, rows, bins)
     index = [dr.minimum(first + j, n_lit - 1) for j in range(block)]
     vectors = [dr.gather(mi.Vector3f, lights.vectors, i) for i in index]
@@ -207,7 +237,7 @@ def _points(scene, surface, table, rows, bins, cell, first, variance):
     # Direct light by way of broad lobes is in the table where they are the table's.
     context = lobes.drawn if lobes.exact else lobes.full
 
-    def entry_values(entry):
+    def entry_values(entry: JitArray) -> tuple[JitArray, JitArray, JitArray, list[JitArray]]:
         e = unpacked(packets, entry, 16)
         si = dr.zeros(mi.SurfaceInteraction3f, width)
         s, shading = mi.Vector3f(e[:3]), mi.Vector3f(e[4:7])
@@ -228,7 +258,7 @@ def _points(scene, surface, table, rows, bins, cell, first, variance):
 
     colours = tuple(mi.Color3f(zero) for _ in range(block))
 
-    def step_of_means(entry, sums):
+    def step_of_means(entry: JitArray, sums: tuple[JitArray, ...]) -> tuple[JitArray, tuple[JitArray, ...]]:
         part, _, _, values = entry_values(entry)
         return entry + 1, tuple(dr.fma(part, value, a) for value, a in zip(values, sums, strict=True))
 
@@ -236,24 +266,46 @@ def _points(scene, surface, table, rows, bins, cell, first, variance):
         _, sums = dr.while_loop((begin, colours), lambda entry, *_: entry < end, step_of_means)
         return list(sums), None
 
-    def step(entry, scale, weights, last_w, last_pair, last, dd, dx, dw, sums):
+    def step(
+        entry: JitArray,
+        scale: JitArray,
+        weights: tuple[JitArray, JitArray],
+        last_w: JitArray,
+        last_pair: JitArray,
+        last: Sequence[JitArray],
+        dd: Sequence[JitArray],
+        dx: Sequence[JitArray],
+        dw: JitArray,
+        sums: Sequence[JitArray],
+    ) -> tuple[JitArray, ...]:
         part, weight, record, values = entry_values(entry)
         # The partner of the same stratum comes just before; alone in the texel, an entry differs from 0.
         pair = record >> 1
         together = pair == last_pair
-        last, dd, dx, sums = list(last), list(dd), list(dx), list(sums)
+        latest, dds, dxs, totals = list(last), list(dd), list(dx), list(sums)
         kept_w = dr.select(together, last_w, 0)
         for j in range(block):
-            sums[j] = dr.fma(part, values[j], sums[j])
+            totals[j] = dr.fma(part, values[j], totals[j])
             value = weight * values[j]
-            kept = dr.select(together, last[j], 0)
-            dd[j] = dr.fma(value, value - 2 * kept, dd[j])
-            dx[j] = dr.fma(value, weight - kept_w, dr.fma(-kept, weight, dx[j]))
-            last[j] = value
+            kept = dr.select(together, latest[j], 0)
+            dds[j] = dr.fma(value, value - 2 * kept, dds[j])
+            dxs[j] = dr.fma(value, weight - kept_w, dr.fma(-kept, weight, dxs[j]))
+            latest[j] = value
         dw = dr.fma(weight, weight - 2 * kept_w, dw)
         weights = weights[0] + weight, dr.fma(weight, weight, weights[1])
         scale = dr.fma(part, part, scale)
-        return entry + 1, scale, weights, weight, pair, tuple(last), tuple(dd), tuple(dx), dw, tuple(sums)
+        return (
+            entry + 1,
+            scale,
+            weights,
+            weight,
+            pair,
+            tuple(latest),
+            tuple(dds),
+            tuple(dxs),
+            dw,
+            tuple(totals),
+        )
 
     nothing = dr.full(mi.UInt32, 0xFFFFFFFF, width)
     state = (begin, zero, (zero, zero), zero, nothing, colours, colours, colours, zero, colours)

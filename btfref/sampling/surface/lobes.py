@@ -7,7 +7,15 @@ be negative: nothing but noise depends on how good the split is.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from btfref.types import JitArray
 
 #: Entries of the table of a: those of Mitsuba's rough plastic, so that its lobe is the table's to the last bits.
 N_TABLE = 64
@@ -38,7 +46,7 @@ class BroadLobes:
         Lobes that the rest is sampled by.
     """
 
-    def __init__(self, bsdfs):
+    def __init__(self, bsdfs: Sequence[JitArray]) -> None:
         import drjit as dr
         import mitsuba as mi
 
@@ -68,7 +76,7 @@ class BroadLobes:
         self._kind, self._table = mi.Float(kind), mi.Float(tables.ravel())
         self.table = tables
 
-    def _separated(self, bsdf):
+    def _separated(self, bsdf: JitArray) -> tuple[np.ndarray | None, float]:
         """The table of a when the BSDF keeps its diffuse lobe apart and that lobe separates, else None; deviation."""
         import drjit as dr
         import mitsuba as mi
@@ -76,7 +84,9 @@ class BroadLobes:
         z = np.linspace(0, 1, N_TABLE)
         z[0] = 1e-3
 
-        def value(context, wi, wo, uv=(0.37, 0.61)):
+        def value(
+            context: JitArray, wi: np.ndarray, wo: np.ndarray, uv: ArrayLike = (0.37, 0.61)
+        ) -> np.ndarray:
             si = dr.zeros(mi.SurfaceInteraction3f, len(wi))
             si.wi, si.uv = mi.Vector3f(wi.T.astype(np.float32)), mi.Point2f(np.asarray(uv, np.float32))
             si.n = mi.Normal3f(0, 0, 1)
@@ -108,7 +118,7 @@ class BroadLobes:
         deviation = np.abs(model - measured).max() / measured.max()
         return (None, np.inf) if deviation > SEPARABLE else (table, deviation)
 
-    def albedo(self, bsdf, index, si, active=True):
+    def albedo(self, bsdf: JitArray, index: JitArray, si: JitArray, active: JitArray = True) -> JitArray:
         """ρ at surface points; 0 where the BSDF has no broad lobe.
 
         Parameters
@@ -137,7 +147,7 @@ class BroadLobes:
         far = bsdf.eval(self.full, probe, mi.Vector3f(0, 0.8660254, 0.5), active & (kind == 1))
         return dr.pi * mi.Color3f(dr.select(kind == 2, value, dr.select(kind == 1, 2 * far, 0)))
 
-    def shape(self, index, cosine, active=True):
+    def shape(self, index: JitArray, cosine: JitArray, active: JitArray = True) -> JitArray:
         """a(cos θ); 0 at and below the horizon."""
         import drjit as dr
         import mitsuba as mi
@@ -149,13 +159,22 @@ class BroadLobes:
         b = dr.gather(mi.Float, self._table, at + 1, active)
         return dr.select(cosine > 0, dr.lerp(a, b, t), 0)
 
-    def value(self, index, albedo, wi, wo):
+    def value(self, index: JitArray, albedo: JitArray, wi: JitArray, wo: JitArray) -> JitArray:
         """Broad lobe times cosine of ``wo``."""
         import drjit as dr
 
         return albedo * (self.shape(index, wi.z) * self.shape(index, wo.z) * dr.maximum(wo.z, 0) * dr.inv_pi)
 
-    def sample_rest(self, bsdf, index, albedo, si, lobe, uv, active):
+    def sample_rest(
+        self,
+        bsdf: JitArray,
+        index: JitArray,
+        albedo: JitArray,
+        si: JitArray,
+        lobe: JitArray,
+        uv: JitArray,
+        active: JitArray,
+    ) -> tuple[JitArray, JitArray]:
         """Sample the rest: (BSDFSample3f, weight = rest · cosine / pdf)."""
         import drjit as dr
 
@@ -167,18 +186,24 @@ class BroadLobes:
             weight = weight - dr.select(smooth, self.value(index, albedo, si.wi, sample.wo) / sample.pdf, 0)
         return sample, weight
 
-    def eval_rest(self, bsdf, index, albedo, si, wo, active):
+    def eval_rest(
+        self, bsdf: JitArray, index: JitArray, albedo: JitArray, si: JitArray, wo: JitArray, active: JitArray
+    ) -> JitArray:
         """The rest times cosine of ``wo``."""
         return self._less_broad(bsdf.eval(self.drawn, si, wo, active), index, albedo, si, wo)
 
-    def eval_pdf_rest(self, bsdf, index, albedo, si, wo, active):
+    def eval_pdf_rest(
+        self, bsdf: JitArray, index: JitArray, albedo: JitArray, si: JitArray, wo: JitArray, active: JitArray
+    ) -> tuple[JitArray, JitArray]:
         """`eval_rest` and `pdf_rest` for the price of little more than one."""
         value, pdf = bsdf.eval_pdf(self.drawn, si, wo, active)
         return self._less_broad(value, index, albedo, si, wo), pdf
 
-    def _less_broad(self, value, index, albedo, si, wo):
+    def _less_broad(
+        self, value: JitArray, index: JitArray, albedo: JitArray, si: JitArray, wo: JitArray
+    ) -> JitArray:
         return value - self.value(index, albedo, si.wi, wo) if self.any and not self.masked else value
 
-    def pdf_rest(self, bsdf, si, wo, active):
+    def pdf_rest(self, bsdf: JitArray, si: JitArray, wo: JitArray, active: JitArray) -> JitArray:
         """Density (per solid angle) of `sample_rest`."""
         return bsdf.pdf(self.drawn, si, wo, active)

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from btfref.numerics.device_arrays import to_device
 from btfref.sampling.surface.points import texel_of
+
+if TYPE_CHECKING:
+    from btfref.sampling.surface.lobes import BroadLobes
+    from btfref.sampling.surface.points import Points
+    from btfref.sampling.surface.walks import Surface
 
 #: Pairs of directions of the pilot, and the most evaluations of a BSDF at once.
 PAIRS, TOGETHER = 64, 1 << 22
@@ -14,7 +21,14 @@ PAIRS, TOGETHER = 64, 1 << 22
 _SEED = 2003
 
 
-def contrast(surface, points, lobes, directions, visible, texels):
+def contrast(
+    surface: Surface,
+    points: Points,
+    lobes: BroadLobes,
+    directions: np.ndarray,
+    visible: np.ndarray,
+    texels: tuple[int, int],
+) -> np.ndarray:
     """Spread of direct light inside texels, as the density of points feels it.
 
     Parameters
@@ -39,7 +53,7 @@ def contrast(surface, points, lobes, directions, visible, texels):
     n, count = len(directions), len(points.weight)
     rng = np.random.default_rng(_SEED)
     pairs = rng.integers(0, n, (PAIRS, 2))
-    groups = tuple(-(-side // 2) for side in texels)
+    groups = -(-texels[0] // 2), -(-texels[1] // 2)
     result = np.zeros(count)
     step = max(1, TOGETHER // count)
     for first in range(0, PAIRS, step):
@@ -58,7 +72,7 @@ def contrast(surface, points, lobes, directions, visible, texels):
     return np.sqrt(result / PAIRS)
 
 
-def _direct(surface, lobes, directions, pairs):
+def _direct(surface: Surface, lobes: BroadLobes, directions: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Mean over channels of BSDF times cosine at all records for pairs (view, light): (pairs, records)."""
     import drjit as dr
     import mitsuba as mi

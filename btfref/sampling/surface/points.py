@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from btfref.sampling.surface.triangles import Triangles
 
 
 @dataclass
@@ -30,7 +35,7 @@ class Points:
     weight: np.ndarray
 
 
-def sample_points(triangles, density, count, rng):
+def sample_points(triangles: Triangles, density: np.ndarray, count: int, rng: np.random.Generator) -> Points:
     """Two independent sets of points, each stratified along the curve through the triangles.
 
     Parameters
@@ -57,13 +62,13 @@ def sample_points(triangles, density, count, rng):
     return _at(triangles.take(index), bary, weight)
 
 
-def centroids(triangles):
+def centroids(triangles: Triangles) -> Points:
     """The centroids of all triangles, as `Points` whose weights are the triangles' areas."""
     bary = np.full((len(triangles.area), 3), 1 / 3)
     return _at(triangles, bary, triangles.area)
 
 
-def _at(triangles, bary, weight):
+def _at(triangles: Triangles, bary: np.ndarray, weight: np.ndarray) -> Points:
     p, shading, uv = (
         np.einsum("pk,pkx->px", bary, values)
         for values in (triangles.corners, triangles.normals, triangles.uv)
@@ -75,7 +80,7 @@ def _at(triangles, bary, weight):
     return Points(p, n, s, shading, uv, triangles.part, weight)
 
 
-def texel_of(p, w, texels):
+def texel_of(p: np.ndarray, w: np.ndarray, texels: tuple[int, int]) -> np.ndarray:
     """Texel whose square on z = 0 the ray from ``p`` along ``w`` crosses.
 
     Parameters
@@ -124,7 +129,15 @@ class Bins:
     part: np.ndarray
 
     @classmethod
-    def sorted(cls, texel, record, weight, half, flux, n_texels):
+    def sorted(
+        cls,
+        texel: np.ndarray,
+        record: np.ndarray,
+        weight: np.ndarray,
+        half: np.ndarray,
+        flux: np.ndarray,
+        n_texels: int,
+    ) -> Bins:
         """From entries in the order of their records."""
         totals = np.bincount(half * n_texels + texel, weight, 2 * n_texels).reshape(2, -1)
         shares = np.where(totals > 0, 0.5 * (1 + totals - totals[::-1]) / np.maximum(totals, 1e-300), 0.0)
@@ -143,14 +156,16 @@ class Bins:
         )
 
 
-def starts(bins):
+def starts(bins: Sequence[Bins]) -> np.ndarray:
     """Where the entries of several bins, one after the other, begin: (len(bins) · texels + 1,) uint32."""
     offsets = np.cumsum([0, *(len(some.record) for some in bins)])
     parts = [some.start[:-1] + np.uint32(k) for some, k in zip(bins, offsets, strict=False)]
     return np.append(np.concatenate(parts), offsets[-1]).astype(np.uint32)
 
 
-def footprints(points, visible, w, texels):
+def footprints(
+    points: Points, visible: np.ndarray, w: np.ndarray, texels: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where the visible points fall in one view.
 
     Parameters

@@ -13,12 +13,20 @@ of the broad lobe at q comes with the walks from v alone, and of that at p with 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from btfref.numerics.device_arrays import packed, to_device, unpacked
 from btfref.sampling.surface.points import starts
 from btfref.sampling.surface.walks import Surface, connect, continue_walks
 from btfref.sampling.tiled_scene import rotated, stream_keys, uniforms
+
+if TYPE_CHECKING:
+    from btfref.sampling.surface.estimator import SurfaceScene
+    from btfref.sampling.surface.points import Bins
+    from btfref.types import JitArray
 
 #: Walks that start together: a bound on memory, without influence on the result.
 TOGETHER = 1 << 20
@@ -32,7 +40,7 @@ STREAMS = 1024
 BLOCK = 1 << 14
 
 
-def lanes(directions, texel, sample):
+def lanes(directions: np.ndarray, texel: np.ndarray, sample: np.ndarray) -> np.ndarray:
     """Numbers of random streams: of a direction's own vector, whatever else is asked for.
 
     Parameters
@@ -48,13 +56,13 @@ def lanes(directions, texel, sample):
     return (lane % (1 << 32)).astype(np.uint32)
 
 
-def stream_numbers(directions):
+def stream_numbers(directions: np.ndarray) -> np.ndarray:
     """First random stream of each direction: ndarray (k,) uint32."""
     bits = np.round(directions * 1e6).astype(np.int64) @ np.array([73856093, 19349663, 83492791])
     return (bits.astype(np.uint64) * np.uint64(2654435761) % np.uint64(1 << 32)).astype(np.uint32)
 
 
-def _choose(bins, cell, half, u):
+def _choose(bins: list[Bins], cell: JitArray, half: JitArray, u: JitArray) -> tuple[JitArray, JitArray]:
     """One entry of a half for each of some cells, drawn by weight.
 
     Parameters
@@ -80,7 +88,7 @@ def _choose(bins, cell, half, u):
     start = to_device(mi.UInt32, starts(bins))
     begin, end = dr.gather(mi.UInt32, start, cell), dr.gather(mi.UInt32, start, cell + 1)
 
-    def share(i):
+    def share(i: JitArray) -> JitArray:
         mine = mi.UInt32(dr.gather(mi.UInt8, halves, i)) == half
         return dr.select(mine, dr.gather(mi.Float, weight, i), 0)
 
@@ -89,12 +97,12 @@ def _choose(bins, cell, half, u):
     target = u * total
     dr.eval(target)
 
-    def look(i, below, found):
+    def look(i: JitArray, below: JitArray, found: JitArray) -> tuple[JitArray, JitArray, JitArray]:
         some = share(i)
         return i + 1, below + some, dr.select((some > 0) & (below <= target), i, found)
 
-    state = (begin, dr.zeros(mi.Float, dr.width(cell)), dr.full(mi.UInt32, _NONE, dr.width(cell)))
-    found = dr.while_loop(state, lambda i, below, found: i < end, look)[2]
+    start_of_look = (begin, dr.zeros(mi.Float, dr.width(cell)), dr.full(mi.UInt32, _NONE, dr.width(cell)))
+    found = dr.while_loop(start_of_look, lambda i, below, found: i < end, look)[2]
     dr.eval(found)
     return found, found != _NONE
 
@@ -114,7 +122,18 @@ class TexelWalks:
     n_texels, n_vertices, seed, stream : int
     """
 
-    def __init__(self, scene, surface, bins, *, per_half, n_texels, n_vertices, seed, stream):
+    def __init__(
+        self,
+        scene: SurfaceScene,
+        surface: Surface,
+        bins: list[Bins],
+        *,
+        per_half: int,
+        n_texels: int,
+        n_vertices: int,
+        seed: int,
+        stream: int,
+    ) -> None:
         self.scene, self.per_half, self.n_texels = scene, per_half, n_texels
         self.n_vertices = n_vertices
         self.keys = stream_keys(seed, stream)
@@ -125,13 +144,14 @@ class TexelWalks:
             part = self._start(surface, bins[first : first + step], first)
             if part is not None:
                 parts.append(part)
-        self.hits = None
+        #: What the walks found first; empty where none found anything.
+        self.hits: dict[str, Any] = {}
         if parts:
             self.hits = _joined(parts)
             self.range = np.searchsorted(self.hits["direction"], np.arange(len(bins) + 1))
             self._look()
 
-    def _start(self, surface, bins, first):
+    def _start(self, surface: Surface, bins: list[Bins], first: int) -> dict[str, Any] | None:
         """Walks from the texels of some directions to their first hits."""
         import drjit as dr
         import mitsuba as mi
@@ -206,7 +226,7 @@ class TexelWalks:
         numbers = {"direction": first + which // 2, "half": which % 2, "sample": sample, "texel": texel}
         return gathered | numbers | {"surface": surface.taken(there)}
 
-    def _look(self):
+    def _look(self) -> None:
         """Visibility of the hits, and what does not depend on where they send light."""
         import drjit as dr
         import mitsuba as mi
@@ -228,7 +248,7 @@ class TexelWalks:
         first = np.searchsorted(self.photons.numpy(), self.range)
         self.photon_range = to_device(mi.UInt32, first)
 
-    def radiance(self, rows):
+    def radiance(self, rows: Sequence[int]) -> JitArray:
         """Light by way of the rest for some directions: [direction, half, texel, light, 3]."""
         import drjit as dr
         import mitsuba as mi
@@ -236,7 +256,7 @@ class TexelWalks:
         lights, hits = self.scene.lights, self.hits
         n_lit = lights.count
         target = dr.zeros(mi.Float, len(rows) * 2 * self.n_texels * n_lit * 3)
-        if hits is None:
+        if not hits:
             return target
         index = np.concatenate([np.arange(self.range[k], self.range[k + 1]) for k in rows])
         place = np.repeat(np.arange(len(rows)), [self.range[k + 1] - self.range[k] for k in rows])
@@ -244,7 +264,7 @@ class TexelWalks:
             self._bring(target, index, place)
         return target
 
-    def _bring(self, target, index, place):
+    def _bring(self, target: JitArray, index: np.ndarray, place: np.ndarray) -> None:
         """Connect some hits to all lights and follow their walks."""
         import drjit as dr
         import mitsuba as mi
@@ -255,14 +275,14 @@ class TexelWalks:
         offset, at = to_device(mi.UInt32, slot * (3 * lights.count)), to_device(mi.UInt32, index)
         share, n, coded = dr.opaque(mi.Float, 1 / self.per_half), dr.opaque(mi.UInt32, cache.n), hits["coded"]
 
-        def bring(i):
+        def bring(i: JitArray) -> Callable[[JitArray, JitArray], JitArray]:
             i = dr.gather(mi.UInt32, at, i)
             si, bsdf, number, albedo = hits["surface"].interaction(i)
             e = unpacked(self.what, i, 12)
             si.wi, gain = si.to_local(mi.Vector3f(e[4:7])), share * mi.Color3f(e[8:11])
             facing, density = e[3], e[7]
 
-            def from_light(w, k):
+            def from_light(w: JitArray, k: JitArray) -> JitArray:
                 seen = cache.value(dr.gather(mi.UInt8, coded, dr.fma(i, n, k)))
                 local, lit = si.to_local(w), seen != 0
                 value = lobes.eval_rest(bsdf, number, albedo, si, local, lit)
@@ -298,7 +318,7 @@ class TexelWalks:
             vertex=3, last=self.n_vertices, stride=3, broad_first=False, count=self.per_half,
         )  # fmt: skip
 
-    def splatted(self, rows, texels, variance=True):
+    def splatted(self, rows: Sequence[int], texels: tuple[int, int], variance: bool = True) -> list[JitArray]:
         """Photons as the texels of some directions see them: sums, and with a variance sums of squares.
 
         Returns
@@ -313,7 +333,7 @@ class TexelWalks:
         n_lit = lights.count
         size = len(rows) * self.n_texels * n_lit * 3
         targets = [dr.zeros(mi.Float, size) for _ in range(1 + variance)]
-        if hits is None:
+        if not hits:
             return targets
         surface, cache, lobes = hits["surface"], scene.cache, scene.lobes
         # A lane is a light and a view. Few as they are, they are spread so that every thread gets its share.
@@ -333,7 +353,7 @@ class TexelWalks:
         base = (place * n_lit + light) * self.n_texels
         n = dr.opaque(mi.UInt32, cache.n)
 
-        def step(entry):
+        def step(entry: JitArray) -> tuple[JitArray]:
             i = dr.gather(mi.UInt32, self.photons, entry)
             seen = cache.value(dr.gather(mi.UInt8, hits["coded"], dr.fma(i, n, row)))
             si, bsdf, number, albedo = surface.interaction(i)
@@ -362,14 +382,14 @@ class TexelWalks:
         return targets
 
 
-def _joined(parts):
+def _joined(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Hits of several groups of directions, one after the other."""
     import drjit as dr
 
     if len(parts) == 1:
         return parts[0]
 
-    def both(a, b):
+    def both(a: Any, b: Any) -> Any:
         if isinstance(a, np.ndarray):
             return np.concatenate([a, b])
         if isinstance(a, Surface):

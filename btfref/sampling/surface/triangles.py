@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from btfref.mesostructure.base import Mesostructure
 
 #: Share of the points that goes by area alone: what the pilot rays took for hidden is sampled as well.
 FLOOR = 0.25
@@ -49,7 +53,7 @@ class Triangles:
     area: np.ndarray
     part: np.ndarray
 
-    def take(self, index):
+    def take(self, index: np.ndarray) -> Triangles:
         """The triangles of an index or mask."""
         return Triangles(*(getattr(self, field.name)[index] for field in fields(self)))
 
@@ -77,7 +81,7 @@ class Descent:
     row: np.ndarray
 
 
-def triangles(mesostructure, largest):
+def triangles(mesostructure: Mesostructure, largest: float) -> tuple[Triangles, Descent]:
     """Triangles of all parts and of the absorber, split until none is larger than ``largest``.
 
     Parameters
@@ -136,11 +140,13 @@ def triangles(mesostructure, largest):
     row = np.zeros(len(order), np.uint32)
     row[order] = np.arange(len(order), dtype=np.uint32)
     starts = np.concatenate([[0], np.cumsum([len(level) for level in levels])[:-1]])
-    words = (starts[:-1], np.concatenate(levels), np.concatenate(firsts))
-    return result.take(order), Descent(*(word.astype(np.uint32) for word in words), row)
+    part_start, face_level, face_first = (
+        word.astype(np.uint32) for word in (starts[:-1], np.concatenate(levels), np.concatenate(firsts))
+    )
+    return result.take(order), Descent(part_start, face_level, face_first, row)
 
 
-def _quartered(values, depth):
+def _quartered(values: np.ndarray, depth: int) -> np.ndarray:
     """Triangles (F, 3, k) cut ``depth`` times into four, the pieces of each in a row: (4**depth · F, 3, k)."""
     for _ in range(depth):
         a, b, c = values[:, 0], values[:, 1], values[:, 2]
@@ -151,7 +157,7 @@ def _quartered(values, depth):
     return values
 
 
-def _tangents(corners, uv, facet):
+def _tangents(corners: np.ndarray, uv: np.ndarray, facet: np.ndarray) -> np.ndarray:
     """∂p/∂u of each triangle; any tangent where the texture coordinates are degenerate."""
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     d1, d2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
@@ -166,7 +172,7 @@ def _tangents(corners, uv, facet):
     return np.where(good[:, None], tangent, other)
 
 
-def _morton(points):
+def _morton(points: np.ndarray) -> np.ndarray:
     """Place of points along a space-filling curve over the tile."""
     cell = np.floor((points[:, :2] % 1.0) * 1024).astype(np.uint64)
     key = np.zeros(len(points), np.uint64)
@@ -176,7 +182,7 @@ def _morton(points):
     return key
 
 
-def density(triangles, views, visible, varied):
+def density(triangles: Triangles, views: np.ndarray, visible: np.ndarray, varied: np.ndarray) -> np.ndarray:
     """Points per area of each triangle, relative, to see every view's texels about equally well.
 
     Parameters

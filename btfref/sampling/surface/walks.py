@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from btfref.numerics.device_arrays import in_one_kernel, packed, to_device, unpacked
 from btfref.sampling.paths.estimator import ROULETTE_LIMIT, ROULETTE_VERTEX
 from btfref.sampling.tiled_scene import uniforms
+from btfref.types import JitArray
+
+if TYPE_CHECKING:
+    from btfref.sampling.surface.cache import VisibilityCache
+    from btfref.sampling.surface.lobes import BroadLobes
+    from btfref.sampling.surface.points import Points
+    from btfref.sampling.tiled_scene import TiledScene
 
 #: Lights that one lane serves where vertices are connected to them.
 LIGHTS_PER_LANE = 3
 
 _FIELDS = ("p", "n", "s", "shading", "uv", "number", "albedo")
+
+
+#: What vertices bring: of the numbers of some, a function of a light and the number of its direction.
+Bring: TypeAlias = Callable[[JitArray], Callable[[JitArray, JitArray], JitArray]]
 
 
 @dataclass
@@ -44,7 +56,7 @@ class Surface:
     table: Any = None
 
     @classmethod
-    def of_points(cls, points, lobes):
+    def of_points(cls, points: Points, lobes: BroadLobes) -> Surface:
         """From `btfref.sampling.surface.points.Points`."""
         import mitsuba as mi
 
@@ -61,7 +73,7 @@ class Surface:
         return place._finished(lobes)
 
     @classmethod
-    def of_interaction(cls, hit, lobes):
+    def of_interaction(cls, hit: JitArray, lobes: BroadLobes) -> Surface:
         """From surface interactions; invalid ones become the absorber."""
         import drjit as dr
         import mitsuba as mi
@@ -78,7 +90,7 @@ class Surface:
         )
         return place._finished(lobes)
 
-    def _finished(self, lobes):
+    def _finished(self, lobes: BroadLobes) -> Surface:
         import drjit as dr
 
         si, bsdf, number, _ = self.interaction(None)
@@ -87,7 +99,7 @@ class Surface:
         dr.eval(self._values())
         return self._tabled()
 
-    def _tabled(self):
+    def _tabled(self) -> Surface:
         import drjit as dr
         import mitsuba as mi
 
@@ -107,7 +119,7 @@ class Surface:
         self.table = packed([x for value in values for x in (value if dr.depth_v(value) > 1 else (value,))])
         return self
 
-    def taken(self, index):
+    def taken(self, index: JitArray) -> Surface:
         """The records of an index (mitsuba.UInt32)."""
         import drjit as dr
 
@@ -115,11 +127,11 @@ class Surface:
         dr.eval(*parts)
         return Surface(*parts)._tabled()
 
-    def joined(self, other):
+    def joined(self, other: Surface) -> Surface:
         """These records and then the others."""
         import drjit as dr
 
-        def both(a, b):
+        def both(a: JitArray, b: JitArray) -> JitArray:
             if dr.depth_v(a) == 1:
                 return dr.concat([a, b])
             return type(a)(*(dr.concat([a[k], b[k]]) for k in range(len(a))))
@@ -128,10 +140,12 @@ class Surface:
         dr.eval(*parts)
         return Surface(*parts)._tabled()
 
-    def _values(self):
+    def _values(self) -> list[JitArray]:
         return [getattr(self, name) for name in _FIELDS]
 
-    def interaction(self, index, active=True):
+    def interaction(
+        self, index: JitArray | None, active: JitArray = True
+    ) -> tuple[JitArray, JitArray, JitArray, JitArray]:
         """Surface interactions, BSDF pointers, their numbers, and ρ, at an index (None for all)."""
         import drjit as dr
         import mitsuba as mi
@@ -157,7 +171,9 @@ class Surface:
         return si, dr.reinterpret_array(mi.BSDFPtr, number), number, albedo
 
 
-def visibility(tiles, surface, directions, *, front_only=False):
+def visibility(
+    tiles: TiledScene, surface: Surface, directions: np.ndarray, *, front_only: bool = False
+) -> np.ndarray:
     """Which directions the records see.
 
     Parameters
@@ -183,7 +199,7 @@ def visibility(tiles, surface, directions, *, front_only=False):
     si = dr.zeros(mi.SurfaceInteraction3f, n_records)
     si.p, si.n = surface.p, mi.Normal3f(surface.n)
 
-    def look(i):
+    def look(i: JitArray) -> tuple[JitArray]:
         w = dr.gather(mi.Vector3f, vectors, i)
         active = dr.dot(si.n, w) > 0 if front_only else mi.Bool(True)
         free = active & ~tiles.occluded(si.spawn_ray(w), active)
@@ -209,14 +225,14 @@ class Lights:
     rows: Any
 
     @property
-    def count(self):
+    def count(self) -> int:
         """Number of lights."""
         import drjit as dr
 
         return dr.width(self.rows)
 
 
-def connect(lights, target, offset, bring, *, stride):
+def connect(lights: Lights, target: JitArray, offset: JitArray, bring: Bring, *, stride: int) -> None:
     """Add what vertices get from all lights to ``target``, in the order of the vertices.
 
     Parameters
@@ -249,7 +265,7 @@ def connect(lights, target, offset, bring, *, stride):
     rows = [dr.gather(mi.UInt32, lights.rows, k) for k in chosen]
     begin, end = dr.gather(mi.UInt32, start, place), dr.gather(mi.UInt32, start, place + 1)
 
-    def step(i, sums):
+    def step(i: JitArray, sums: tuple[JitArray, ...]) -> tuple[JitArray, tuple[JitArray, ...]]:
         from_light = bring(dr.gather(mi.UInt32, order, i))
         return i + 1, tuple(a + from_light(*light) for a, *light in zip(sums, vectors, rows, strict=True))
 
@@ -258,7 +274,7 @@ def connect(lights, target, offset, bring, *, stride):
     _, sums = dr.while_loop(state, lambda i, _: i < end, step)
     at = dr.gather(mi.UInt32, places, place)
 
-    def write():
+    def write() -> None:
         for j, value in enumerate(sums):
             inside = light + j < count
             for channel in range(3):
@@ -275,8 +291,20 @@ def connect(lights, target, offset, bring, *, stride):
 
 
 def continue_walks(
-    tiles, lobes, cache, lights, target, state, keys, *, vertex, last, stride, broad_first, count
-):
+    tiles: TiledScene,
+    lobes: BroadLobes,
+    cache: VisibilityCache,
+    lights: Lights,
+    target: JitArray,
+    state: dict[str, JitArray],
+    keys: Sequence[JitArray],
+    *,
+    vertex: int,
+    last: int,
+    stride: int,
+    broad_first: bool,
+    count: int,
+) -> None:
     """Follow walks from their first ray to the last vertex, connecting each vertex to all lights.
 
     Parameters
@@ -344,7 +372,9 @@ def continue_walks(
         vertex += 1
 
 
-def _bringing(lobes, cache, vertices, broad):
+def _bringing(
+    lobes: BroadLobes, cache: VisibilityCache, vertices: tuple[Surface, JitArray, JitArray], broad: bool
+) -> Bring:
     """What `connect` asks for, at vertices of walks: by the broad lobe alone, or by the whole BSDF."""
     import drjit as dr
     import mitsuba as mi
@@ -352,12 +382,12 @@ def _bringing(lobes, cache, vertices, broad):
     surface, what, coded = vertices
     n = dr.opaque(mi.UInt32, cache.n)
 
-    def bring(i):
+    def bring(i: JitArray) -> Callable[[JitArray, JitArray], JitArray]:
         si, bsdf, number, albedo = surface.interaction(i)
         e = unpacked(what, i, 8)
         si.wi, gain = mi.Vector3f(e[:3]), mi.Color3f(e[4:7])
 
-        def from_light(w, row):
+        def from_light(w: JitArray, row: JitArray) -> JitArray:
             seen = cache.value(dr.gather(mi.UInt8, coded, dr.fma(i, n, row)))
             local = si.to_local(w)
             if broad:
