@@ -31,7 +31,8 @@ btfref.doctor
 btfref.system btfref.provenance
 btfref.registry btfref.platform btfref.outputs
 btfref.conventions
-btfref.errors btfref.precision btfref.types
+btfref.errors btfref.precision
+btfref.types
 """.split("\n")[1:-1]
 
 LEVEL = {name: level for level, line in enumerate(FLOORS) for name in line.split()}
