@@ -83,7 +83,7 @@ def test_keywords_are_settings_or_the_mesostructures():
     ],
 )
 def test_stores_say_what_they_always_said(settings, parameters):
-    """What a store of version 0.1 says: others would not resume."""
+    """Literally: a store that is there resumes only when it says the same."""
     said = {
         "texels": [64, 64],
         "spp": 64,
@@ -112,7 +112,7 @@ def test_settings_and_keywords_make_the_same_btf(tmp_path):
 
 @pytest.mark.usefixtures("llvm")
 def test_a_store_that_did_not_say_its_llvm_is_continued(tmp_path):
-    """Stores of version 0.1 have no version of LLVM; one of another is not continued."""
+    """Stores made before it was recorded have none; one of another LLVM is not continued."""
     out = tmp_path / "a.btf.zarr"
 
     def interrupt(done, total, label):
