@@ -70,6 +70,13 @@ def test_links_resolve(path):
             assert anchor in anchors(file), f"{path.name} links to {target}"
 
 
+def test_the_layout_shows_every_floor():
+    source = (ROOT / "tests" / "unit" / "test_floors.py").read_text("utf-8")
+    (floors,) = re.findall(r'^FLOORS = """\n(.*?)"""', source, re.MULTILINE | re.DOTALL)
+    shown = re.findall(r"`([\w.]+)`", (PAGES / "reference" / "layout.md").read_text("utf-8"))
+    assert set(floors.split()) - {"btfref.__main__", "btfref.docs"} <= set(shown)
+
+
 def test_versions_agree():
     changelog = (ROOT / "CHANGELOG.md").read_text("utf-8")
     released = re.findall(r"^## \[(\d+\.\d+\.\d+)\] – (\d{4}-\d\d-\d\d)$", changelog, re.MULTILINE)
