@@ -14,7 +14,7 @@ import numpy as np
 from btfref.conventions import FILTER_TYPES
 from btfref.errors import InputError
 from btfref.numerics.footprint import MODES
-from btfref.numerics.sphere.frames import nearest_rotation
+from btfref.numerics.sphere.frames import uv_transform
 from btfref.registry import method
 from mitsuba_plugins.lib.footprint import LevelOfDetail
 from mitsuba_plugins.lib.guide import LightGuide
@@ -47,35 +47,6 @@ class Maps:
         self.tensors = {
             name: tensor(array) for name, array in arrays.items() if not name.startswith(("view_", "light_"))
         }
-
-
-def uv_transform(matrix):
-    """Affine map of texture coordinates and the rotation that it gives to the local frame.
-
-    Parameters
-    ----------
-    matrix : array_like, shape (4, 4) or (3, 3)
-        Mitsuba's ``to_uv``.
-
-    Returns
-    -------
-    affine : ndarray, shape (2, 3)
-    rotation : tuple of float
-        Cosine and sine of the angle by which local directions turn about the normal to reach the texture's frame:
-        that of the rotation nearest to the linear part.
-
-    Raises
-    ------
-    InputError
-        For a mirroring or singular transform, which would make the local frame left-handed.
-    """
-    m = np.asarray(matrix, float)
-    affine = np.concatenate([m[:2, :2], m[:2, -1:]], 1)
-    if np.linalg.det(affine[:, :2]) <= 0:
-        raise InputError(
-            "the transform mirrors or is singular", field="to_uv", expected="a positive determinant"
-        )
-    return affine, nearest_rotation(affine[:, :2])
 
 
 def make_bsdf():

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.scene.first_hits import MARGIN, Touched, light_directions
+from btfref.scene.first_hits import MARGIN, Touched
 
 #: Which maps of a file renderers load.
 KEEP = ("all", "needed")
@@ -140,8 +140,8 @@ def demand(
     InputError
         For a scene that cannot be read.
     """
-    from btfref.scene.camera import film_rays, grid_offsets
     from btfref.scene.description import read_scene
+    from btfref.scene.hits import surfaces
     from btfref.scene.loading import loaded
 
     description = read_scene(scene, parameters, size=size, missing_btf=shape is not None)
@@ -151,22 +151,18 @@ def demand(
         if mesh.material is not None and mesh.material.filename not in wanted:
             wanted[mesh.material.filename] = Touched(mesh.material.filename, shape, least)
     from_everywhere = description.environment is not None
-    offsets = grid_offsets(grid)
     with loaded(scene, parameters, size=size, plain=True) as made:
         # Samples of the next pixel are ``grid`` samples away.
         beside = None
         if margin is None:
             beside = int(made.sensors()[0].film().crop_size()[0]), min(1.0, 2 / grid)
-        for number, offset in enumerate(offsets):
-            ray, _ = film_rays(made.sensors()[0], offset)
-            si = made.ray_intersect(ray)
-            lights = light_directions(made, si)
+        camera, angle = description.camera, description.camera.pixel_angle / grid
+        for number, surface in enumerate(surfaces(made, grid)):
             for mesh, one in zip(description.meshes, made.shapes(), strict=True):
                 if mesh.material is not None:
-                    footprint = description.camera.pixel_angle / grid
-                    wanted[mesh.material.filename].add(si, one, lights, mesh.material, footprint, beside)
+                    wanted[mesh.material.filename].add(surface, one, mesh.material, camera, angle, beside)
             if progress is not None:
-                progress(number + 1, len(offsets), "first hits")
+                progress(number + 1, grid**2, "first hits")
     return {name: Demand(name, *found.result(from_everywhere, indirect)) for name, found in wanted.items()}
 
 

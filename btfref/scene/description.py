@@ -9,6 +9,7 @@ import numpy as np
 
 from btfref.errors import InputError, MissingDependencyError
 from btfref.numerics.footprint import MODES
+from btfref.numerics.sphere.frames import uv_transform
 from btfref.platform import prepare_llvm
 from btfref.scene import parsing
 from btfref.scene.environment import Environment, from_emitter
@@ -246,14 +247,8 @@ def _material(parsed, shape):
             got=filter_type,
             expected="nearest or bilinear",
         )
-    to_uv = np.eye(4) if "to_uv" not in props else np.array(props["to_uv"].matrix, float)
-    # Rows and columns of x, y and the translation, as Transform4f::extract() takes them.
-    affine = to_uv[:2][:, [0, 1, 3]]
-    if np.linalg.det(affine[:, :2]) <= 0:
-        where = parsed.location(node)
-        raise InputError(
-            "the transform mirrors or is singular", file=where, field="to_uv", expected="a determinant > 0"
-        )
+    matrix = np.eye(4) if "to_uv" not in props else np.array(props["to_uv"].matrix, float)
+    affine, _ = uv_transform(matrix, file=parsed.location(node))
     numbers = {name: float(props[name]) for name in ("scale", "lod_bias", "lod_unit") if name in props}
     mode = str(props["lod"]) if "lod" in props else "auto"
     if mode not in MODES:

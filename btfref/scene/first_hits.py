@@ -6,6 +6,7 @@ import numpy as np
 
 from btfref.conventions import texel_stencil
 from btfref.numerics.sphere import interpolation
+from btfref.scene.hits import Hits
 
 #: Least margin of directions, radians: renderers round.
 MARGIN = 1e-4
@@ -54,35 +55,39 @@ class Touched:
         self.pairs, self.texels = np.zeros(counts, bool), np.zeros(self.size, bool)
         self.least_lod, self.lookups = np.inf, 0
 
-    def add(self, si, shape, lights, material, footprint, beside=None):
+    def add(self, surface, shape, material, camera, angle, beside=None):
         """Count the lookups of one shape's first hits.
 
-        ``beside``: width of the picture, and share of the changes from pixel to pixel that is margin.
+        Parameters
+        ----------
+        surface : Surface
+        shape : mitsuba.Shape
+        material : BtfMaterial
+            The shape's.
+        camera : Camera
+        angle : float
+            That a sample subtends, in radians.
+        beside : (int, float), optional
+            Width of the picture, and share of the changes from pixel to pixel that is margin.
         """
-        import mitsuba as mi
-
-        seen = np.array(si.is_valid() & (si.shape == mi.ShapePtr(shape)))
-        if not seen.any():
-            return
-        towards = np.array(si.wi, float).T
-        w_view, side = _local(towards[seen], material)
-        front = w_view[:, 2] > -self.margin
+        seen = surface.sees(shape)
+        hits = Hits.of(surface, material, np.flatnonzero(seen))
+        front = hits.w_view[:, 2] > -self.margin
         if not front.any():
             return
-        affine = material.to_uv
-        uv = np.array(si.uv, float).T[seen][front] @ affine[:, :2].T + affine[:, 2]
-        w_view = w_view[front]
-        view_sets = self._touched(self.tables[0], w_view, self._margins(towards, seen, beside)[front])
+        hits = Hits.of(surface, material, hits.at[front])
+        margin = self._margins(surface["wi"], seen, beside)[front]
+        view_sets = self._touched(self.tables[0], hits.w_view, margin)
         self.views[view_sets.all_touched()] = True
-        self._touch_texels(uv, w_view)
+        self._touch_texels(hits.uv, hits.w_view)
         if material.lod == "auto" and material.lod_bias == 0:
-            self._touch_levels(si, seen, front, material, footprint)
+            lod, _, _ = hits.footprint(camera.origin, angle, self.size)
+            self.least_lod = min(self.least_lod, float(lod.min()))
         else:
             self.least_lod = 0.0
-        self.lookups += len(uv) * len(lights)
-        for light in lights:
-            w_light, _ = _local(light[seen], material, side)
-            w_light, margin = w_light[front], self._margins(light, seen, beside)[front]
+        self.lookups += len(hits.at) * len(surface.lights)
+        for light in surface.lights:
+            w_light, margin = hits.local(light[hits.at]), self._margins(light, seen, beside)[front]
             lit = np.isfinite(w_light).all(1) & (w_light[:, 2] > -margin)
             if not lit.any():
                 continue
@@ -131,27 +136,6 @@ class Touched:
         for rows in (-1, 0, 1):
             for columns in (-1, 0, 1):
                 self.texels |= np.roll(there, (rows, columns), (0, 1))
-
-    def _touch_levels(self, si, seen, front, material, footprint):
-        from btfref.numerics.footprint import cone_footprint
-
-        du, dv, n = (np.array(a, float).T[seen][front] for a in (si.dp_du, si.dp_dv, si.n))
-        distance = np.array(si.t, float)[seen][front]
-        # Rows of the inverse of (dp_du, dp_dv) in the tangent plane are the gradients of u and v.
-        gram = np.stack([(du * du).sum(-1), (du * dv).sum(-1), (dv * dv).sum(-1)], -1)
-        determinant = gram[:, 0] * gram[:, 2] - gram[:, 1] ** 2
-        scale = 1 / np.where(determinant > 0, determinant, 1)[:, None]
-        gradients = [
-            (gram[:, 2:3] * du - gram[:, 1:2] * dv) * scale,
-            (gram[:, 0:1] * dv - gram[:, 1:2] * du) * scale,
-        ]
-        a = material.to_uv
-        rows, columns = self.size
-        u = columns * (a[0, 0] * gradients[0] + a[0, 1] * gradients[1])
-        v = rows * (a[1, 0] * gradients[0] + a[1, 1] * gradients[1])
-        towards = np.array(si.to_world(si.wi), float).T[seen][front]
-        lod, _, _ = cone_footprint(u, v, towards, n, footprint * distance)
-        self.least_lod = min(self.least_lod, float(lod.min()))
 
     def result(self, from_everywhere, indirect):
         """Views, lights, pairs, texels, finest level and number of lookups, as of :class:`btfref.scene.demand.Demand`.
@@ -209,27 +193,6 @@ def _mark_pairs(pairs, views, lights, lit):
         inside = (view >= 0)[:, :, None] & (light >= 0)[:, None, :]
         flat = view[:, :, None] * pairs.shape[1] + light[:, None, :]
         pairs.reshape(-1)[flat[inside]] = True
-
-
-def light_directions(scene, si):
-    """Local directions towards every delta light, each of shape (n, 3), float64."""
-    import mitsuba as mi
-
-    result = []
-    for emitter in scene.emitters():
-        sample, _ = emitter.sample_direction(si, mi.Point2f(0.5))
-        result.append(np.array(si.to_local(sample.d), float).T)
-    return result
-
-
-def _local(w, material, side=None):
-    """Directions in the texture's frame, and the side of the surface on which the first ones lie."""
-    c, s = material.rotation
-    w = np.stack([c * w[:, 0] - s * w[:, 1], s * w[:, 0] + c * w[:, 1], w[:, 2]], 1)
-    if side is None:
-        side = np.where(w[:, 2] < 0, -1.0, 1.0) if material.twosided else np.ones(len(w))
-    w[:, 2] *= side
-    return w, side
 
 
 def _upper(w):

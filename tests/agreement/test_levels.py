@@ -151,7 +151,7 @@ def test_the_plugin_averages_along_the_footprint(made, fits, llvm, rng):
     matrix = np.array(matrix)
     gradients = [s * (a[0] * of_u + a[1] * of_v) for a, s in zip(matrix, (columns, rows), strict=True)]
     lod, step, ratio = cone_footprint(*gradients, world, [0, 0, 1], angle * distance)
-    from mitsuba_plugins.base import uv_transform
+    from btfref.numerics.sphere.frames import uv_transform
 
     _, (c, s) = uv_transform(np.array(to_uv.matrix))
 

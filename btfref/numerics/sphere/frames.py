@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from btfref.errors import InputError
 from btfref.precision import real
+from btfref.types import PathLike
 
 #: Length of interpolated cosine and sine below which tangents of all directions meet: there is no turn to speak of, and
 #: float32 would make one up (its rounding of 6e-8 turns a tangent by 6e-6 at this length).
@@ -53,6 +55,42 @@ def nearest_rotation(linear: ArrayLike) -> tuple[float, float]:
     cosine, sine = a + d, c - b
     length = float(np.hypot(cosine, sine))
     return (cosine / length, sine / length) if length > 0 else (1.0, 0.0)
+
+
+def uv_transform(
+    matrix: ArrayLike, *, file: PathLike | None = None
+) -> tuple[np.ndarray, tuple[float, float]]:
+    """Affine map of texture coordinates and the rotation that it gives to the local frame.
+
+    Parameters
+    ----------
+    matrix : array_like, shape (4, 4) or (3, 3)
+        Mitsuba's ``to_uv``.
+    file : path-like, optional
+        For messages.
+
+    Returns
+    -------
+    affine : ndarray, shape (2, 3)
+    rotation : tuple of float
+        Cosine and sine of the angle by which local directions turn about the normal to reach the texture's frame:
+        that of the rotation nearest to the linear part.
+
+    Raises
+    ------
+    InputError
+        For a mirroring or singular transform, which would make the local frame left-handed.
+    """
+    m = np.asarray(matrix, float)
+    affine = np.concatenate([m[:2, :2], m[:2, -1:]], 1)
+    if np.linalg.det(affine[:, :2]) <= 0:
+        raise InputError(
+            "the transform mirrors or is singular",
+            file=file,
+            field="to_uv",
+            expected="a positive determinant",
+        )
+    return affine, nearest_rotation(affine[:, :2])
 
 
 def surface_frame(surface: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

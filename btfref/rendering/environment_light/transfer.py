@@ -17,7 +17,7 @@ from btfref.errors import InputError
 from btfref.numerics.solvers.clustering import leading_axes, local_pca
 from btfref.numerics.solvers.lowrank import range_basis
 from btfref.numerics.sphere import harmonics
-from btfref.numerics.sphere.frames import shading_frame
+from btfref.scene.hits import corner_frames
 
 #: Rays from a vertex that find what hides the environment: 1024 make steps of 6 degrees, five bands have lobes of 45.
 RAYS = 1024
@@ -97,15 +97,6 @@ class ClusteredTransfer:
     weights: np.ndarray
     basis: np.ndarray
     error: float
-
-
-def corner_frames(mesh):
-    """Local frames of corners, columns the axes x, y, z in world space, shape (triangles, 3, 3, 3)."""
-    _, normals, _, dp_du = mesh.corners()
-    c, s = mesh.material.rotation
-    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
-    return np.swapaxes(turn @ shading_frame(normals, dp_du[:, None]), -1, -2)
 
 
 def corner_matrices(mesh, order, transfer=None):

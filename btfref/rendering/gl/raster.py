@@ -8,8 +8,8 @@ from btfref.errors import InputError
 from btfref.scene.shapes import neighbours
 
 
-def lod_uniforms(material, texels, angle):
-    """What ``shaders/lib/surface/lod.glsl`` reads.
+def material_uniforms(material, texels, angle):
+    """What ``shaders/hosts/mesh.frag`` and ``shaders/lib/surface/lod.glsl`` read of a material.
 
     Parameters
     ----------
@@ -19,7 +19,13 @@ def lod_uniforms(material, texels, angle):
     angle : float
         That a sample subtends, in radians.
     """
+    row0, row1 = material.to_uv
     return {
+        "uv_row0": row0,
+        "uv_row1": row1,
+        "uv_rotation": material.rotation,
+        "scale": material.scale,
+        "two_sided": material.twosided,
         "lod_angle": angle if material.lod == "auto" else 0.0,
         "lod_unit": material.lod_unit if material.lod == "distance" else 0.0,
         "lod_bias": material.lod_bias,

@@ -19,7 +19,7 @@ from btfref.rendering.gl import device
 from btfref.rendering.gl.raster import (
     clip_planes,
     light_uniforms,
-    lod_uniforms,
+    material_uniforms,
     triangle_table,
     world_to_clip,
 )
@@ -295,12 +295,8 @@ class Renderer:
                     tables["seen"] = self._seen[0]
                     ctx.depth_func, self._target.depth_mask = ">", False
                 device.bind(program, tables)
-                row0, row1 = mesh.material.to_uv
-                own = {"uv_row0": row0, "uv_row1": row1, "scale": mesh.material.scale}
-                own["uv_rotation"] = mesh.material.rotation
-                own["mesh"] = index
-                own |= lod_uniforms(mesh.material, shown.texels, share * camera.pixel_angle)
-                device.set_uniforms(program, {**common, **own, "two_sided": mesh.material.twosided})
+                own = material_uniforms(mesh.material, shown.texels, share * camera.pixel_angle)
+                device.set_uniforms(program, {**common, **own, "mesh": index})
                 passes, counts = ({},), [len(mesh.faces)]
                 if light is not None:
                     passes, counts = light.passes, counts * len(light.passes)

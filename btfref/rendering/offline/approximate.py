@@ -17,7 +17,8 @@ from btfref.rendering.environment_light.lighting import lighting_of
 from btfref.rendering.result import RenderResult
 from btfref.representations.protocol import HasLevels
 from btfref.scene.description import read_scene
-from btfref.scene.visible import visible_points
+from btfref.scene.hits import Hits, surfaces
+from btfref.scene.loading import loaded
 
 
 def approximate(
@@ -60,28 +61,34 @@ def approximate(
     description = read_scene(scene, parameters, size=size)
     if not description.lights and description.environment is None:
         raise InputError("the scene has no light", file=description.source, field="emitter")
+    for mesh in description.meshes:
+        if mesh.material is None:
+            where = f"{description.source}: shape {mesh.name}"
+            raise InputError(
+                "the approximation needs a btf material", file=where, field="bsdf", got=mesh.bsdf
+            )
     lighting = lighting_of(description, path, **options)
-    start = time.perf_counter()
-    reps, prepared, total = {}, {}, None
-    for points in visible_points(
-        scene, description, parameters=parameters, size=size, grid=grid, pixels=pixels
-    ):
-        if total is None:
-            total = np.zeros((points.shape[0] * points.shape[1], 3))
-        name = points.material.filename
-        if name not in reps:
-            reps[name] = (load_file or representations.load)(name)
-        rep = _filtered(reps[name], points.material.filter_type)
-        if lighting is not None:
-            key = (name, points.mesh) if lighting.per_mesh else name
-            if key not in prepared:
-                prepared[key] = lighting.prepared(rep, file=name, mesh=points.mesh)
-        mesh = description.meshes[points.mesh]
-        value = _radiance(rep, points, mesh, description.lights, prepared[key] if lighting else None)
-        total[points.pixel] += points.material.scale * value
-    camera = description.camera
-    if total is None:
-        total = np.zeros((camera.height * camera.width, 3))
+    start, camera = time.perf_counter(), description.camera
+    reps, prepared, total = {}, {}, np.zeros((camera.height * camera.width, 3))
+    wanted = np.full(len(total), True) if pixels is None else np.ravel(pixels)
+    with loaded(scene, parameters, size=size) as made:
+        for surface in surfaces(made, grid):
+            for number, (mesh, shape) in enumerate(zip(description.meshes, made.shapes(), strict=True)):
+                hits = Hits.of(surface, mesh.material, np.flatnonzero(surface.sees(shape) & wanted))
+                if not len(hits.at):
+                    continue
+                name = mesh.material.filename
+                if name not in reps:
+                    reps[name] = (load_file or representations.load)(name)
+                rep = _filtered(reps[name], mesh.material.filter_type)
+                light = None
+                if lighting is not None:
+                    key = (name, number) if lighting.per_mesh else name
+                    if key not in prepared:
+                        prepared[key] = lighting.prepared(rep, file=name, mesh=number)
+                    light = prepared[key]
+                value = _radiance(rep, hits, mesh, description, grid, light)
+                total[hits.at] += mesh.material.scale * value
     image = (total / grid**2).reshape(camera.height, camera.width, 3)
     facts = [{"environment_path": p.path, **p.facts} for p in prepared.values()]
     meta = {
@@ -106,13 +113,16 @@ def _filtered(representation, filter_type):
     return type(representation).from_arrays(representation.arrays(), meta)
 
 
-def _radiance(representation, points, mesh, lights, prepared):
+def _radiance(representation, hits, mesh, description, grid, prepared):
     """Radiance towards the viewer without the material's factor, shape (N, 3)."""
+    levels, camera = isinstance(representation, HasLevels), description.camera
+    texels = representation.meta["texels"]
+    footprint = hits.footprint(camera.origin, camera.pixel_angle / grid, texels) if levels else ()
 
     def evaluate(uv, w_light, w_view, at):
-        if points.footprint is None or not isinstance(representation, HasLevels):
+        if not levels:
             return representation.evaluate(uv, w_light, w_view)
-        lod, step, ratio = (a[at] for a in points.footprint)
+        lod, step, ratio = (a[at] for a in footprint)
         value = np.zeros((len(uv), 3))
         reach = int((ANISOTROPY - 1) / 2)
         for j in range(-reach, reach + 1):
@@ -125,18 +135,16 @@ def _radiance(representation, points, mesh, lights, prepared):
                 value[some] += share[some, None] * found
         return value
 
-    everywhere, total = np.arange(len(points.uv)), np.zeros((len(points.uv), 3))
-    for light in lights:
-        towards, power = light.position - points.position, light.power
+    everywhere, total = np.arange(len(hits.at)), np.zeros((len(hits.at), 3))
+    for light in description.lights:
+        towards, power = light.position - hits.position, light.power
         if light.kind == "directional":
-            towards = np.broadcast_to(light.position, points.position.shape)
+            towards = np.broadcast_to(light.position, hits.position.shape)
         else:
             square = (towards**2).sum(1, keepdims=True)
             towards, power = towards / np.sqrt(square), power / square
-        w_light = np.einsum("ni,nij->nj", towards, points.to_world)
-        total += power * evaluate(points.uv, w_light, points.w_view, everywhere)
+        w_light = np.einsum("ni,nij->nj", towards, hits.to_world)
+        total += power * evaluate(hits.uv, w_light, hits.w_view, everywhere)
     if prepared is not None:
-        total += prepared.radiance(
-            points.uv, points.w_view, points.to_world, evaluate, lambda: points.place(mesh)
-        )
+        total += prepared.radiance(hits.uv, hits.w_view, hits.to_world, evaluate, lambda: hits.place(mesh))
     return total

@@ -17,6 +17,7 @@ from btfref.errors import InputError
 from btfref.rendering.result import RenderResult
 from btfref.scene.camera import film_rays
 from btfref.scene.description import read_scene
+from btfref.scene.hits import Hits
 from btfref.scene.lights import distant_or_delta
 from btfref.scene.loading import loaded
 
@@ -231,19 +232,10 @@ def _intersect(scene, material, offset, pixel, chosen):
 
     ray, _ = film_rays(scene.sensors()[0], offset, pixel)
     si = scene.ray_intersect(ray)
-    (a, b, c), (d, e, f) = material.to_uv.tolist()
-    u, v = si.uv
-    uv = mi.Point2f(dr.fma(u, a, dr.fma(v, b, c)), dr.fma(u, d, dr.fma(v, e, f)))
-    cosine, sine = (float(x) for x in material.rotation)
-    side = dr.select((si.wi.z < 0) & material.twosided, mi.Float(-1), mi.Float(1))
-
-    def local(w):
-        turned = mi.Vector3f(cosine * w.x - sine * w.y, sine * w.x + cosine * w.y, w.z * side)
-        return turned if (cosine, sine) != (1.0, 0.0) else mi.Vector3f(w.x, w.y, w.z * side)
-
+    hits = Hits(material, si.uv, si.wi)
     lights = []
     for emitter in distant_or_delta(scene):
         sample, power = emitter.sample_direction(si, chosen, si.is_valid())
         power = dr.select(si.is_valid() & (sample.pdf > 0), mi.Color3f(power), 0)
-        lights.append((local(si.to_local(sample.d)), power))
-    return si, uv, local(si.wi), lights
+        lights.append((hits.local(si.to_local(sample.d)), power))
+    return si, hits.uv, hits.w_view, lights
