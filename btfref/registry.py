@@ -1,8 +1,8 @@
-"""The methods: one row each, as strings, so that nothing is imported before it is used."""
+"""What is looked up by name: the methods, one row each, as strings, so that nothing is imported before it is used."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -20,6 +20,50 @@ if TYPE_CHECKING:
 
 #: Third parties add rows with entry points of this group; each names an object of type :class:`Method`.
 ENTRY_POINT_GROUP = "btfref.representations"
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """btfref's own rows, and those of an entry-point group.
+
+    Parameters
+    ----------
+    kind : str
+        What a row is, for messages: "format".
+    rows : dict of str to str
+        Name → ``"module:object"``. No package can take the place of one of these.
+    group : str
+        Entry points whose names and objects come after them.
+    """
+
+    kind: str
+    rows: Mapping[str, str]
+    group: str
+
+    def names(self) -> list[str]:
+        """Names of all: btfref's own in their order, then the others in theirs of the alphabet."""
+        found = {point.name for point in entry_points(group=self.group)}
+        return [*self.rows, *sorted(found - self.rows.keys())]
+
+    def load(self, name: str) -> Any:
+        """The object of that name.
+
+        Raises
+        ------
+        InputError
+            When there is none.
+        """
+        if name in self.rows:
+            module, _, attribute = self.rows[name].partition(":")
+            return getattr(import_module(module), attribute)
+        for point in entry_points(group=self.group, name=name):
+            return point.load()
+        raise InputError(
+            f"unknown {self.kind}",
+            field=self.kind,
+            got=repr(name),
+            expected=f"one of {', '.join(self.names())}",
+        )
 
 
 @dataclass(frozen=True)

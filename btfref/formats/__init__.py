@@ -7,11 +7,10 @@ the quantity of its files; `btfref.formats.convert` alone turns that quantity in
 
 from __future__ import annotations
 
-import importlib
-from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
 from btfref.errors import InputError
+from btfref.registry import Catalogue
 from btfref.types import Facts, PathLike
 
 if TYPE_CHECKING:
@@ -42,16 +41,12 @@ FORMATS = {
 
 ENTRY_POINT_GROUP = "btfref.formats"
 
+_CATALOGUE = Catalogue("format", FORMATS, ENTRY_POINT_GROUP)
+
 
 def names() -> list[str]:
-    """Names of all formats, built in and from entry points.
-
-    Returns
-    -------
-    list of str
-    """
-    found = (point.name for point in entry_points(group=ENTRY_POINT_GROUP))
-    return [*FORMATS, *sorted(name for name in found if name not in FORMATS)]
+    """Names of all formats, built in and from entry points."""
+    return _CATALOGUE.names()
 
 
 def format_named(name: str) -> Format:
@@ -62,15 +57,7 @@ def format_named(name: str) -> Format:
     InputError
         When there is none.
     """
-    if name in FORMATS:
-        module, _, attribute = FORMATS[name].partition(":")
-        return getattr(importlib.import_module(module), attribute)
-    for point in entry_points(group=ENTRY_POINT_GROUP):
-        if point.name == name:
-            return point.load()
-    raise InputError(
-        "unknown format", field="format", got=repr(name), expected=f"one of {', '.join(names())}"
-    )
+    return _CATALOGUE.load(name)
 
 
 def identify(path: PathLike) -> str | None:

@@ -9,15 +9,13 @@ add rows through the entry-point group ``btfref.mesostructures``.
 
 from __future__ import annotations
 
-import importlib
 import inspect
-from collections.abc import Callable
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from btfref.errors import InputError
 from btfref.mesostructure.base import Mesostructure, Part
+from btfref.registry import Catalogue
 
 if TYPE_CHECKING:
     from btfref.types import PathLike
@@ -42,30 +40,12 @@ FROM_FILES = {
 
 ENTRY_POINT_GROUP = "btfref.mesostructures"
 
+_CATALOGUE = Catalogue("mesostructure", MESOSTRUCTURES, ENTRY_POINT_GROUP)
+
 
 def names() -> list[str]:
-    """Names of all mesostructures, built in and from entry points, sorted.
-
-    Returns
-    -------
-    list of str
-    """
-    return sorted({*MESOSTRUCTURES, *(point.name for point in entry_points(group=ENTRY_POINT_GROUP))})
-
-
-def _builder(name: str) -> Callable[..., Mesostructure]:
-    if name in MESOSTRUCTURES:
-        module, _, function = MESOSTRUCTURES[name].partition(":")
-        return getattr(importlib.import_module(module), function)
-    for point in entry_points(group=ENTRY_POINT_GROUP):
-        if point.name == name:
-            return point.load()
-    raise InputError(
-        "unknown mesostructure",
-        field="mesostructure",
-        got=repr(name),
-        expected=f"one of {', '.join(names())}",
-    )
+    """Names of all mesostructures, built in and from entry points, sorted."""
+    return sorted(_CATALOGUE.names())
 
 
 def build(mesostructure: PathLike | Mesostructure, **parameters: Any) -> Mesostructure:
@@ -102,7 +82,7 @@ def build(mesostructure: PathLike | Mesostructure, **parameters: Any) -> Mesostr
         if suffix in suffixes:
             parameters = {"file": mesostructure, **parameters}
             mesostructure = name
-    builder = _builder(mesostructure)
+    builder = _CATALOGUE.load(mesostructure)
     known = inspect.signature(builder).parameters
     for key in parameters:
         if key not in known:

@@ -46,7 +46,7 @@ def export_images(
     moved: int = 0,
     progress: Progress | None = None,
 ) -> Facts:
-    """Write a folder (or, when the path ends in ``.zip``, an archive) of decoding.
+    """Write a folder (or, when the path ends in ``.zip``, an archive) of pictures.
 
     Parameters
     ----------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,11 @@ def recogniser(style: str) -> Callable[[Candidate], bool]:
         return candidate.files is not None and style_of(candidate.files.images()) == style
 
     return recognises
+
+
+def opener(name: str, to_linear: ToLinear, *, cosine_included: bool, scale: float) -> Callable[..., Source]:
+    """``open(path, *, allow_missing=False)`` of a format without options of its own; as `image_source`."""
+    return partial(image_source, name=name, to_linear=to_linear, cosine_included=cosine_included, scale=scale)
 
 
 def image_source(

@@ -13,8 +13,8 @@ from functools import cache
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.formats.image_sets.reader import image_source, pick, recogniser
-from btfref.formats.source import Format, Source
+from btfref.formats.image_sets.reader import opener, pick, recogniser
+from btfref.formats.source import Format
 from btfref.numerics.colour import spectral_weights
 from btfref.types import PathLike
 
@@ -56,37 +56,17 @@ def _weights(names: tuple[str, ...]) -> np.ndarray:
     return spectral_weights(wavelengths(names, None)).astype(np.float32)
 
 
-def open_spectral(path: PathLike, *, allow_missing: bool = False) -> Source:
-    """Open a folder or zip archive.
-
-    Parameters
-    ----------
-    path : path-like
-    allow_missing : bool
-        Accept pairs without a picture.
-
-    Returns
-    -------
-    Source
-    """
-
-    def to_linear(pixels: np.ndarray, channels: tuple[str, ...], where: PathLike) -> np.ndarray:
-        if pixels.dtype == np.uint8 or set(channels) == {"R", "G", "B"}:
-            raise InputError(
-                "picture without wavelengths", file=where, field="channels", got=", ".join(channels)
-            )
-        wavelengths(channels, where)
-        return pixels[..., pick(channels, channels, where)] @ _weights(channels)
-
-    return image_source(
-        path, "spectral", to_linear, cosine_included=False, scale=1.0, allow_missing=allow_missing
-    )
+def _to_linear(pixels: np.ndarray, channels: tuple[str, ...], where: PathLike) -> np.ndarray:
+    if pixels.dtype == np.uint8 or set(channels) == {"R", "G", "B"}:
+        raise InputError("picture without wavelengths", file=where, field="channels", got=", ".join(channels))
+    wavelengths(channels, where)
+    return pixels[..., pick(channels, channels, where)] @ _weights(channels)
 
 
 FORMAT = Format(
     "spectral",
     "Bonn SPECTRAL folders of OpenEXR pictures",
     recogniser("spectral"),
-    open_spectral,
+    opener("spectral", _to_linear, cosine_included=False, scale=1.0),
     options=frozenset({"allow_missing"}),
 )

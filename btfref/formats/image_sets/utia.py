@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from btfref.errors import InputError
-from btfref.formats.image_sets.reader import image_source, pick, recogniser
-from btfref.formats.source import Format, Source
+from btfref.formats.image_sets.reader import opener, pick, recogniser
+from btfref.formats.source import Format
 from btfref.numerics.colour import RGB_TO_XYZ, decode_srgb, encode_srgb, rgb_from_xyz
 from btfref.types import Facts, PathLike
 
@@ -28,6 +28,9 @@ WHITE = 100.0
 #: Factor from a reflectance factor to 1/sr.
 SCALE = 1 / np.pi
 
+#: Linear values of 8-bit codes.
+_CURVE = decode_srgb(np.arange(256) / 255).astype(np.float32)
+
 
 def xyz_to_rgb(pixels: ArrayLike) -> np.ndarray:
     """Linear Rec. 709 of UTIA's XYZ (white at Y = 100), same shape, float32."""
@@ -39,31 +42,12 @@ def rgb_to_xyz(values: ArrayLike) -> np.ndarray:
     return np.asarray(values) @ RGB_TO_XYZ.T * WHITE
 
 
-def open_utia(path: PathLike, *, allow_missing: bool = False) -> Source:
-    """Open a folder or zip archive.
-
-    Parameters
-    ----------
-    path : path-like
-    allow_missing : bool
-        Accept pairs without a picture.
-
-    Returns
-    -------
-    Source
-    """
-    curve = decode_srgb(np.arange(256) / 255).astype(np.float32)
-
-    def to_linear(pixels: np.ndarray, channels: tuple[str, ...], where: PathLike) -> np.ndarray:
-        if pixels.dtype == np.uint8:
-            return curve[pixels]
-        # Writers that know three channels only call X, Y and Z by the names of colours.
-        names = ("X", "Y", "Z") if "X" in channels else ("R", "G", "B")
-        return xyz_to_rgb(pixels[..., pick(channels, names, where)])
-
-    return image_source(
-        path, "utia", to_linear, cosine_included=False, scale=SCALE, allow_missing=allow_missing
-    )
+def _to_linear(pixels: np.ndarray, channels: tuple[str, ...], where: PathLike) -> np.ndarray:
+    if pixels.dtype == np.uint8:
+        return _CURVE[pixels]
+    # Writers that know three channels only call X, Y and Z by the names of colours.
+    names = ("X", "Y", "Z") if "X" in channels else ("R", "G", "B")
+    return xyz_to_rgb(pixels[..., pick(channels, names, where)])
 
 
 def export(btf: BTFStore | SampledBTF, path: PathLike, **settings: Any) -> Facts:
@@ -89,7 +73,7 @@ FORMAT = Format(
     "utia",
     "UTIA folders and archives of pictures",
     recogniser("utia"),
-    open_utia,
+    opener("utia", _to_linear, cosine_included=False, scale=SCALE),
     options=frozenset({"allow_missing"}),
     export=export,
     settings=frozenset({"image", "scale", "moved"}),
