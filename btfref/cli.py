@@ -10,6 +10,8 @@ import importlib
 import keyword
 import os
 import sys
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
 
 from btfref.commands import COMMANDS
 from btfref.errors import BtfrefError
@@ -29,11 +31,25 @@ a first look: btfref doctor; btfref demo
 class _Parser(argparse.ArgumentParser):
     """Argument parser whose errors are one line."""
 
-    def error(self, message):
+    def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog.split()[0]}: error: {message} (see `{self.prog} --help`)\n")
 
 
-def build_parser():
+class _Help(argparse.Action):
+    """``--help`` of a command: what its module's ``help_text(parser, args)`` makes of the arguments before it."""
+
+    def __init__(
+        self, option_strings: Sequence[str], dest: str, *, text: Callable[..., str] | None, help: str
+    ) -> None:
+        super().__init__(option_strings, dest, nargs=0, default=argparse.SUPPRESS, help=help)
+        self.text = text
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, *_: Any) -> NoReturn:
+        sys.stdout.write(self.text(parser, namespace) if self.text else parser.format_help())
+        parser.exit()
+
+
+def build_parser() -> argparse.ArgumentParser:
     """The argument parser of ``btfref`` with all its commands.
 
     Returns
@@ -53,29 +69,32 @@ def build_parser():
     for name in COMMANDS:
         # A module cannot carry the name of a keyword: the command `import` is in import_.py.
         module = importlib.import_module(f"btfref.commands.{name}{'_' * keyword.iskeyword(name)}")
-        summary = module.__doc__.splitlines()[0].rstrip(".")
+        summary = (module.__doc__ or "").splitlines()[0].rstrip(".")
         command = commands.add_parser(
             name,
             help=summary[0].lower() + summary[1:],
             description=module.__doc__,
             formatter_class=argparse.RawDescriptionHelpFormatter,
+            add_help=False,
         )
+        text = getattr(module, "help_text", None)
+        command.add_argument("-h", "--help", action=_Help, text=text, help="show this help message and exit")
         module.add_arguments(command)
         command.set_defaults(run=module.run)
     return parser
 
 
-def _complain(message):
+def _complain(message: object) -> int:
     sys.stderr.write(f"btfref: error: {' '.join(str(message).split())}\n")
     return 2
 
 
-def _os_error(error):
+def _os_error(error: OSError) -> str:
     where = f"{error.filename}: " if error.filename is not None else ""
     return where + (error.strerror or str(error))
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
 
     Parameters
@@ -93,7 +112,7 @@ def main(argv=None):
         status = args.run(args)
         sys.stdout.flush()
     except SystemExit as stop:  # argparse: 0 after --help, 2 after a usage error
-        return stop.code or 0
+        return int(stop.code or 0)
     except BtfrefError as error:
         return _complain(error)
     except BrokenPipeError:

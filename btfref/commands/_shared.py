@@ -6,24 +6,30 @@ import json
 import re
 import sys
 from argparse import ArgumentTypeError
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from btfref.errors import InputError
+from btfref.types import PathLike
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
-def emit(text="", *, flush=False):
+def emit(text: str = "", *, flush: bool = False) -> None:
     """Write one line to standard output; `flush` before work that takes long or writes by itself."""
     sys.stdout.write(f"{text}\n")
     if flush:
         sys.stdout.flush()
 
 
-def emit_json(data):
+def emit_json(data: object) -> None:
     """Write `data` to standard output as indented JSON."""
     emit(json.dumps(data, indent=2, ensure_ascii=False, default=_plain))
 
 
-def _plain(value):
+def _plain(value: Any) -> object:
     """NumPy scalars and arrays and paths as what JSON knows."""
     if hasattr(value, "tolist"):
         return value.tolist()
@@ -32,7 +38,7 @@ def _plain(value):
     raise TypeError(f"cannot write {type(value).__name__} as JSON")
 
 
-def value(text):
+def value(text: str) -> Any:
     """A parameter value as typed: what JSON reads (number, boolean, null, list), else the text itself."""
     try:
         return json.loads(text)
@@ -40,7 +46,9 @@ def value(text):
         return text
 
 
-def assignments(items, *, convert=value, option="--set"):
+def assignments(
+    items: Iterable[str] | None, *, convert: Callable[[str], Any] = value, option: str = "--set"
+) -> dict[str, Any]:
     """``key=value`` arguments as a dict.
 
     Raises
@@ -59,7 +67,7 @@ def assignments(items, *, convert=value, option="--set"):
     return result
 
 
-def size(text):
+def size(text: str) -> tuple[int, int]:
     """``WxH`` as ``(width, height)`` in pixels, for argparse's ``type=``."""
     width, _, height = text.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
@@ -67,12 +75,12 @@ def size(text):
     return int(width), int(height)
 
 
-def count(minimum=1):
+def count(minimum: int = 1) -> Callable[[str], int]:
     """A reader of integers of at least `minimum`, for argparse's ``type=``."""
 
-    def read(text):
+    def read(text: str) -> int:
         try:
-            number = int(text)
+            number: int | None = int(text)
         except ValueError:
             number = None
         if number is None or number < minimum:
@@ -82,12 +90,12 @@ def count(minimum=1):
     return read
 
 
-def number_above(minimum):
+def number_above(minimum: float) -> Callable[[str], float]:
     """A reader of finite numbers greater than `minimum`, for argparse's ``type=``."""
 
-    def read(text):
+    def read(text: str) -> float:
         try:
-            found = float(text)
+            found: float | None = float(text)
         except ValueError:
             found = None
         if found is None or not minimum < found < float("inf"):
@@ -97,9 +105,9 @@ def number_above(minimum):
     return read
 
 
-def ranges(text):
+def ranges(text: str) -> tuple[int, ...]:
     """Whole numbers such as ``0,3,10-12`` as a tuple, for argparse's ``type=``."""
-    found = []
+    found: list[int] = []
     for item in text.split(","):
         first, dash, last = item.partition("-")
         if not first.isdecimal() or (dash and not last.isdecimal()):
@@ -108,7 +116,7 @@ def ranges(text):
     return tuple(found)
 
 
-def memory_size(text):
+def memory_size(text: str) -> int:
     """An amount of memory such as ``2G``, ``800MiB`` in bytes, for argparse's ``type=``."""
     found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([kMGT]?)(?:i?B)?", text)
     if found is None or not float(found[1]):
@@ -116,18 +124,7 @@ def memory_size(text):
     return int(float(found[1]) * 1024 ** " kMGT".index(found[2] or " "))
 
 
-def positive(text):
-    """A number above 0, for argparse's ``type=``."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = 0.0
-    if not 0 < number < float("inf"):
-        raise ArgumentTypeError(f"got {text!r}, expected a number above 0")
-    return number
-
-
-def numbers_or_file(text):
+def numbers_or_file(text: str) -> float | tuple[float, ...] | str:
     """Numbers such as ``0.5`` or ``0.5,0.2,0.1`` (a float, a tuple), else the text itself, for argparse."""
     try:
         found = tuple(float(item) for item in text.split(","))
@@ -136,7 +133,7 @@ def numbers_or_file(text):
     return found[0] if len(found) == 1 else found
 
 
-def direction_set(text):
+def direction_set(text: str) -> str | np.ndarray:
     """A direction set by name, or from a text file with one ``theta phi`` pair in degrees per line.
 
     Returns
@@ -163,7 +160,7 @@ def direction_set(text):
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
 
 
-def output_file(text, *suffixes):
+def output_file(text: PathLike, *suffixes: str) -> Path:
     """Path of an output, refused early when it cannot be written or has a suffix that no writer takes.
 
     Raises
@@ -190,17 +187,17 @@ class Progress:
     #: Seconds before a bar is worth showing.
     delay = 2.0
 
-    def __init__(self):
-        self._bar = None
+    def __init__(self) -> None:
+        self._bar: Any = None  # tqdm, which carries no types
 
-    def __enter__(self):
+    def __enter__(self) -> Progress:
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         if self._bar is not None:
             self._bar.close()
 
-    def __call__(self, done, total, label=""):
+    def __call__(self, done: int, total: int, label: str = "") -> None:
         from tqdm import tqdm
 
         if self._bar is None or self._bar.desc != f"{label}: " or self._bar.total != total:
@@ -214,14 +211,14 @@ class Progress:
         self._bar.update(done - self._bar.n)
 
 
-def table(rows, *, header=None):
+def table(rows: Iterable[Iterable[object]], *, header: Iterable[object] | None = None) -> list[str]:
     """Rows of cells as aligned lines; numbers to the right, text to the left."""
-    rows = [[str(cell) for cell in row] for row in rows]
-    every = [*([[str(cell) for cell in header]] if header else []), *rows]
+    body = [[str(cell) for cell in row] for row in rows]
+    every = [*([[str(cell) for cell in header]] if header else []), *body]
     if not every:
         return []
     widths = [max(len(row[column]) for row in every) for column in range(len(every[0]))]
-    right = [all(_numeric(row[column]) for row in rows) for column in range(len(every[0]))]
+    right = [all(_numeric(row[column]) for row in body) for column in range(len(every[0]))]
     lines = [
         "  ".join(
             cell.rjust(width) if flag else cell.ljust(width)
@@ -234,11 +231,11 @@ def table(rows, *, header=None):
     return lines
 
 
-def _numeric(text):
+def _numeric(text: str) -> bool:
     return not text or text[0].isdigit() or text[0] in "-+–.∞"
 
 
-def number(value):
+def number(value: float | str | None) -> str:
     """A metric for a reader: four significant digits, a dash for none."""
     if value is None:
         return "–"
@@ -247,7 +244,7 @@ def number(value):
     return f"{value:.4g}"
 
 
-def bytes_text(n):
+def bytes_text(n: float) -> str:
     """A number of bytes for a reader: ``1.9 MiB (2 012 345 bytes)``."""
     amount, unit = float(n), "bytes"
     for unit in ("bytes", "KiB", "MiB", "GiB", "TiB"):
@@ -256,67 +253,3 @@ def bytes_text(n):
         amount /= 1024
     exact = f"{int(n):,} bytes".replace(",", " ")
     return exact if unit == "bytes" else f"{amount:.3g} {unit} ({exact})"
-
-
-def write_images(image, out, *, png=False, classes=None, classes_out=None):
-    """Write a linear image as float32 EXR, and what else was asked for.
-
-    Parameters
-    ----------
-    image : ndarray, shape (H, W, 3)
-    out : pathlib.Path
-        The EXR file; `png` adds a tone-mapped PNG of the same name.
-    classes : ndarray of uint8, shape (H, W), optional
-        Pixel classes, written to `classes_out`.
-    """
-    from btfref.images import save_image
-
-    save_image(out, image)
-    if png:
-        save_image(out.with_suffix(".png"), image)
-    if classes is not None:
-        save_classes(classes_out, classes)
-
-
-#: Grey levels of a class file in the order of `btfref.conventions.PixelClass`, so that a person sees the classes.
-_CLASS_GREYS = (0, 100, 200, 250)
-
-
-def save_classes(path, classes):
-    """Write pixel classes (see `btfref.scene.pixel_classes`) as a grey PNG: black, dark, light, nearly white."""
-    import numpy as np
-
-    from btfref.images.png import encode_png
-    from btfref.outputs import new_file
-
-    with new_file(path) as draft:
-        draft.write_bytes(encode_png(np.array(_CLASS_GREYS, np.uint8)[classes]))
-
-
-def load_classes(path):
-    """Pixel classes as `save_classes` wrote them.
-
-    Returns
-    -------
-    ndarray of uint8, shape (H, W)
-
-    Raises
-    ------
-    InputError
-        When the file is missing, not a PNG, or holds another grey level.
-    """
-    import numpy as np
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
-            grey = np.asarray(image.convert("L"))
-    except FileNotFoundError:
-        raise InputError("no such file", file=path, field="--classes") from None
-    except (OSError, SyntaxError, ValueError):
-        raise InputError("cannot be read as PNG", file=path, field="--classes") from None
-    known = list(_CLASS_GREYS)
-    if not np.isin(grey, known).all():
-        odd = int(grey[~np.isin(grey, known)][0])
-        raise InputError("not pixel classes", file=path, got=f"grey level {odd}", expected=known)
-    return np.searchsorted(known, grey).astype(np.uint8)

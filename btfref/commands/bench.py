@@ -8,18 +8,25 @@ rounds.
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from btfref.bench import SUITES
 from btfref.bench.plan import SUFFIX, shipped
+from btfref.commands._options import add_json, add_only, words
 from btfref.commands._shared import Progress, emit, emit_json, output_file, table
 from btfref.errors import InputError
+from btfref.types import Facts
+
+if TYPE_CHECKING:
+    from btfref.sampling import SampledBTF
 
 #: Words in the place of a suite that read results instead.
 READERS = ("compare", "report")
 
 
-def add_arguments(parser):
+def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
     plans, suites = ", ".join(shipped()), ", ".join(sorted(SUITES))
     parser.add_argument(
@@ -28,7 +35,7 @@ def add_arguments(parser):
     parser.add_argument("folders", nargs="*", metavar="FOLDER", help="results, for report and compare")
     parser.add_argument("--quick", action="store_true", help="less data or fewer rounds")
     parser.add_argument("--btf", metavar="BTF", help="a sampled BTF (.btf.zarr) instead of the suite's own")
-    parser.add_argument("--only", metavar="METHOD[,METHOD]", help="these methods instead of all")
+    add_only(parser)
     parser.add_argument(
         "-o",
         "--output",
@@ -41,10 +48,10 @@ def add_arguments(parser):
     parser.add_argument(
         "--report", metavar="FILE.html", help="a page with the pictures, of suites that have any"
     )
-    parser.add_argument("--json", action="store_true", help="print metrics or the raw result as JSON")
+    add_json(parser, "metrics or the raw result")
 
 
-def run(args):
+def run(args: Namespace) -> int:
     """Carry the command out."""
     if args.suite in READERS:
         return _compare(args) if args.suite == "compare" else _report(args)
@@ -58,7 +65,7 @@ def run(args):
     raise InputError("no such plan or suite", field="WHAT", got=args.suite, expected=known)
 
 
-def _plan(args):
+def _plan(args: Namespace) -> int:
     import tempfile
 
     from btfref.bench.matrix import run as run_plan
@@ -68,7 +75,7 @@ def _plan(args):
 
     if args.plot or args.report:
         raise InputError("diagrams of plans are made by: btfref bench report FOLDER", field="--report")
-    plan = read_plan(shipped().get(args.suite, args.suite), quick=args.quick, only=_only(args))
+    plan = read_plan(shipped().get(args.suite, args.suite), quick=args.quick, only=words(args.only))
     with tempfile.TemporaryDirectory() as scratch, Progress() as progress:
         folder = Path(args.output or scratch)
         number = run_plan(plan, folder, btf=_btf(args), progress=progress)
@@ -85,7 +92,7 @@ def _plan(args):
     return 0
 
 
-def _report(args):
+def _report(args: Namespace) -> int:
     import json
 
     from btfref.bench.tables import markdown, panels, summary, tables
@@ -112,7 +119,7 @@ def _report(args):
     return 0
 
 
-def _compare(args):
+def _compare(args: Namespace) -> int:
     from btfref.bench.tables import compared
 
     if len(args.folders) != 2:
@@ -130,7 +137,7 @@ def _compare(args):
     return 0
 
 
-def _suite(args):
+def _suite(args: Namespace) -> int:
     import importlib
     import inspect
     import json
@@ -140,8 +147,9 @@ def _suite(args):
     suite = importlib.import_module(SUITES[args.suite])
     if plot and args.suite != "synth" and not hasattr(suite, "plot"):
         raise InputError("this suite has no plot", field="--plot", got=args.suite, expected="env or synth")
-    options = {"only": _only(args)} if args.only else {}
-    if plot and args.suite == "synth" and args.only and "growth" not in _only(args):
+    only = words(args.only)
+    options: Facts = {"only": only} if only else {}
+    if plot and args.suite == "synth" and only and "growth" not in only:
         raise InputError(
             "the plot is that of the growth", field="--only", got=args.only, expected="growth too"
         )
@@ -172,11 +180,7 @@ def _suite(args):
     return 0
 
 
-def _only(args):
-    return args.only.split(",") if args.only else None
-
-
-def _btf(args):
+def _btf(args: Namespace) -> SampledBTF | None:
     if not args.btf:
         return None
     from btfref.sampling import SampledBTF

@@ -11,23 +11,30 @@ checker.lpca.exr -D lights=points2`. A PNG is judged as what 8 bits can show.
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from btfref.commands._images import load_classes
+from btfref.commands._options import add_define, add_grid, add_json, add_size
 from btfref.commands._shared import (
     assignments,
-    count,
     emit,
     emit_json,
-    load_classes,
     number,
     output_file,
-    size,
     table,
 )
 from btfref.errors import InputError
 
+if TYPE_CHECKING:
+    import numpy as np
 
-def add_arguments(parser):
+    from btfref.comparison import Comparison
+
+
+def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
     parser.add_argument("test", metavar="TEST", help="image (EXR or PNG)")
     parser.add_argument("reference", metavar="REFERENCE", help="image of the same size, or a scene")
@@ -36,20 +43,20 @@ def add_arguments(parser):
     scene = parser.add_argument_group("when REFERENCE is a scene")
     scene.add_argument("--method", metavar="FILE|KEY", help="the representation, or a method to fit to --btf")
     scene.add_argument("--btf", metavar="BTF", help="sampled BTF (.btf.zarr) for --method KEY")
-    scene.add_argument(
-        "-D", dest="define", action="append", metavar="KEY=VALUE", help="parameter of the scene"
-    )
-    scene.add_argument("--size", type=size, metavar="WxH", help="of the film (default: the picture's)")
-    scene.add_argument("--grid", type=count(1), default=4, metavar="N", help="N × N sub-pixels (default 4)")
+    add_define(scene)
+    add_size(scene, "of the film, in pixels (default: the picture's)")
+    add_grid(scene)
     scene.add_argument("--shadows", action="store_true", help="the picture has cast shadows")
     scene.add_argument("--cache", metavar="FOLDER", help="of references (default: the user's cache)")
-    parser.add_argument("--json", action="store_true", help="print metrics and gates as JSON")
+    add_json(parser, "metrics and gates")
     parser.add_argument("--report", metavar="OUT.html", help="also write a report")
 
 
-def run(args):
+def run(args: Namespace) -> int:
     """Carry the command out."""
     report = output_file(args.report, ".html") if args.report else None
+
+    import numpy as np
 
     from btfref.comparison import compare
     from btfref.images import load_image
@@ -66,7 +73,7 @@ def run(args):
         comparison = compare(test, reference, classes=classes, gate=args.gate)
     else:
         comparison = _against_scene(args, test)
-        reference = comparison.reference.astype("float32")
+        reference = np.asarray(comparison.reference, np.float32)
     if report:
         from btfref.provenance import versions
         from btfref.report import Cell, write_report
@@ -83,7 +90,7 @@ def run(args):
     return 0 if comparison.passed else 1
 
 
-def _against_scene(args, test):
+def _against_scene(args: Namespace, test: np.ndarray) -> Comparison:
     """The comparison with the reference of a scene."""
     from btfref.validate.own_renderer import judge_image, reference_of, representation_for
 
@@ -103,7 +110,7 @@ def _against_scene(args, test):
     return judge_image(args.test, found, gates=args.gate)
 
 
-def lines(comparison):
+def lines(comparison: Comparison) -> Iterator[str]:
     """Metrics and gates of a comparison for a reader."""
     classes = [name for name, metrics in comparison.metrics.items() if metrics]
     names = list(dict.fromkeys(name for key in classes for name in comparison.metrics[key]))

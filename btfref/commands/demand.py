@@ -10,8 +10,12 @@ traces what is needed alone.
 
 from __future__ import annotations
 
-import numpy as np
+import math
+from argparse import ArgumentParser, Namespace, _ActionsContainer
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
+from btfref.commands._options import add_define, add_grid, add_json, add_size, help_with_scenes
 from btfref.commands._shared import (
     Progress,
     assignments,
@@ -20,41 +24,48 @@ from btfref.commands._shared import (
     emit,
     emit_json,
     number_above,
-    size,
     table,
 )
 from btfref.errors import InputError
 
+if TYPE_CHECKING:
+    from btfref.numerics.sphere.directions import DirectionSet
+    from btfref.scene.demand import Demand
 
-def add_arguments(parser):
+    #: Views, lights and texels of a BTF that is not there yet.
+    Shape = tuple[DirectionSet, DirectionSet, tuple[int, int]]
+
+
+def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
     parser.add_argument("scene", nargs="+", metavar="SCENE", help="scene files, or names of shipped scenes")
     add_scene_arguments(parser)
     parser.add_argument("--views", metavar="SET", help="of a BTF that is not there yet, as for synth")
     parser.add_argument("--lights", metavar="SET", help="likewise (default: as the views)")
     parser.add_argument("--texels", type=count(1), metavar="N", help="likewise, per side (default 64)")
-    parser.add_argument("--json", action="store_true", help="print numbers and indices as JSON")
+    add_json(parser, "numbers and indices")
 
 
-def add_scene_arguments(parser):
+def help_text(parser: ArgumentParser, args: Namespace) -> str:
+    """Help of the command, with what ships."""
+    return help_with_scenes(parser)
+
+
+def add_scene_arguments(parser: _ActionsContainer) -> None:
     """What says how scenes are looked at: `synth --for` shares it."""
-    parser.add_argument(
-        "-D", dest="define", action="append", metavar="KEY=VALUE", help="parameter of the scenes"
-    )
+    add_define(parser, of="the scenes")
     parser.add_argument(
         "--sweep",
         action="append",
         metavar="KEY=A,B,…",
         help="parameter of the scenes, one picture for each value",
     )
-    parser.add_argument(
-        "--grid", type=count(1), default=4, metavar="N", help="N × N rays a pixel (default 4)"
-    )
-    parser.add_argument("--size", type=size, metavar="WxH", help="of the images, in pixels")
+    add_grid(parser, text="N × N rays a pixel (default 4)")
+    add_size(parser, "of the images, in pixels (default: the scenes')")
     parser.add_argument(
         "--margin",
         type=number_above(0),
-        metavar="RADIANS",
+        metavar="DEGREES",
         help="by which directions may be off (default: by what they change between samples)",
     )
     parser.add_argument(
@@ -62,8 +73,10 @@ def add_scene_arguments(parser):
     )
 
 
-def run(args):
+def run(args: Namespace) -> int:
     """Carry the command out."""
+    import numpy as np
+
     from btfref.scene.demand import maps_needed
 
     shape = None
@@ -96,14 +109,14 @@ def run(args):
     return 0
 
 
-def whole_shape(views, lights, texels):
+def whole_shape(views: str, lights: str, texels: int) -> Shape:
     """Shape of a BTF that is not there yet, for :func:`btfref.scene.demand.demand`."""
     from btfref.numerics.sphere.directions import directions
 
     return directions(direction_set(views)), directions(direction_set(lights)), (texels, texels)
 
 
-def union(args, scenes, shape):
+def union(args: Namespace, scenes: Sequence[str], shape: Shape | None) -> dict[str, Demand]:
     """What all scenes and all values of swept parameters need, by BTF file.
 
     Raises
@@ -114,20 +127,19 @@ def union(args, scenes, shape):
     import itertools
 
     from btfref.scene.demand import demand
-    from btfref.scene.shipped import scene_file
 
     fixed = assignments(args.define, convert=str, option="-D")
     swept = assignments(args.sweep, convert=lambda text: text.split(","), option="--sweep")
     frames = [dict(zip(swept, values, strict=True)) for values in itertools.product(*swept.values())]
-    found = {}
+    found: dict[str, Demand] = {}
     with Progress() as progress:
         for scene, frame in itertools.product(scenes, frames):
             one = demand(
-                scene_file(scene),
+                scene,
                 parameters=fixed | frame,
                 grid=args.grid,
                 size=args.size,
-                margin=args.margin,
+                margin=None if args.margin is None else math.radians(args.margin),
                 shape=shape,
                 indirect=args.indirect,
                 progress=progress,

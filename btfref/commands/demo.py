@@ -6,18 +6,21 @@ with OpenGL, and compares the images. A finished store is used again.
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
+
+from btfref.commands._options import add_json
 from btfref.commands._shared import Progress, emit, emit_json, number, table
 
 
-def add_arguments(parser):
+def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
     parser.add_argument(
         "-o", "--output", default="output/demo", metavar="FOLDER", help="default: output/demo"
     )
-    parser.add_argument("--json", action="store_true", help="print metrics, gates and times as JSON")
+    add_json(parser, "metrics, gates and times")
 
 
-def run(args):
+def run(args: Namespace) -> int:
     """Carry the command out."""
     from btfref.demo import demo
 

@@ -7,21 +7,28 @@ missing. With --mend, only the system libraries are looked at, and the missing o
 from __future__ import annotations
 
 import sys
+from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
+from btfref.commands._options import add_json
 from btfref.commands._shared import bytes_text, emit, emit_json
 from btfref.errors import MissingDependencyError
+
+if TYPE_CHECKING:
+    from btfref.doctor import Examination
 
 _MARKS = {"ok": ("✓", "32"), "missing": ("✗", "31"), "warning": ("!", "33"), "absent": ("–", "2")}
 
 
-def add_arguments(parser):
+def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
-    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+    add_json(parser, "everything")
     parser.add_argument("--mend", action="store_true", help="install missing system libraries with apt")
     parser.add_argument("--for-tests", action="store_true", help="with --mend: also what only the tests need")
 
 
-def run(args):
+def run(args: Namespace) -> int:
     """Carry the command out."""
     if args.mend:
         return _mend(args.for_tests)
@@ -36,10 +43,10 @@ def run(args):
     return 0 if examination.ok else 1
 
 
-def lines(examination, *, colour=False):
+def lines(examination: Examination, *, colour: bool = False) -> Iterator[str]:
     """The examination for a reader, problems and their mends last."""
 
-    def paint(text, code):
+    def paint(text: str, code: str) -> str:
         return f"\x1b[{code}m{text}\x1b[0m" if colour else text
 
     machine = examination.facts["machine"]
@@ -68,7 +75,7 @@ def lines(examination, *, colour=False):
     )
 
 
-def _mend(for_tests):
+def _mend(for_tests: bool) -> int:
     from btfref import system
 
     needed = system.missing()

@@ -6,6 +6,9 @@ as it is (BDI); maps: a folder of OpenEXR images. Losses and clipped values are 
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
+
+from btfref.commands._options import add_json
 from btfref.commands._shared import Progress, count, emit, emit_json, number, number_above, output_file
 from btfref.errors import InputError
 
@@ -24,7 +27,7 @@ _SETTINGS = (
 )
 
 
-def add_arguments(parser):
+def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
     parser.add_argument(
         "btf", metavar="BTF", help="sampled BTF (.btf.zarr), or representation (.exr) for maps"
@@ -49,10 +52,10 @@ def add_arguments(parser):
     bonn.add_argument("--error", type=number_above(0), metavar="E", help="relative RMS error that decides K")
     bonn.add_argument("--colour-model", type=int, choices=(0, 11), help="0: RGB (default), 11: as UBO2014")
     bonn.add_argument("--scalar", type=int, choices=(2, 4), help="bytes of a factor (default 2)")
-    parser.add_argument("--json", action="store_true", help="print what was written as JSON")
+    add_json(parser, "what was written")
 
 
-def run(args):
+def run(args: Namespace) -> int:
     """Carry the command out."""
     out = output_file(args.output, *{"bonn": (".btf",)}.get(args.format, ()))
     settings = {key: getattr(args, key) for key in _SETTINGS if getattr(args, key) is not None}
@@ -76,7 +79,7 @@ def run(args):
     return 0
 
 
-def _text(fact):
+def _text(fact: object) -> str:
     if isinstance(fact, list):
         return "/".join(map(_text, fact))
     return number(fact) if isinstance(fact, float) else str(fact)

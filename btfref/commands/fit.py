@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from btfref.commands._shared import Progress, assignments, bytes_text, count, emit, emit_json, output_file
+from btfref.commands._options import add_json, add_seed
+from btfref.commands._shared import Progress, assignments, bytes_text, emit, emit_json, output_file
 from btfref.errors import InputError
 
 
@@ -33,8 +34,18 @@ def add_arguments(parser: ArgumentParser) -> None:
         action="store_true",
         help="take a store of which only a part is there, as synth --for fills it (methods that can)",
     )
-    parser.add_argument("--seed", type=count(0), default=0, metavar="N")
-    parser.add_argument("--json", action="store_true", help="print the facts of the file as JSON")
+    add_seed(parser)
+    add_json(parser, "the facts of the file")
+
+
+def help_text(parser: ArgumentParser, args: Namespace) -> str:
+    """Help of the command with all methods, or of the method that stands before ``--help``."""
+    from btfref.commands import _method_help
+    from btfref.registry import method
+
+    if args.method:
+        return _method_help.method_help(method(args.method))
+    return "\n".join([parser.format_help(), *_method_help.methods_help()])
 
 
 def run(args: Namespace) -> int:

@@ -7,6 +7,10 @@ BDI) and MERL .binary; maps: a folder of edited maps (of export); photograph: on
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+
+from btfref.commands._options import add_dtype, add_json
 from btfref.commands._shared import (
     Progress,
     bytes_text,
@@ -19,7 +23,7 @@ from btfref.commands._shared import (
 )
 
 
-def add_arguments(parser):
+def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
     parser.add_argument("path", metavar="PATH", help="file, folder or archive")
     parser.add_argument(
@@ -47,15 +51,13 @@ def add_arguments(parser):
         "--views", metavar="SET", help="directions of a MERL BRDF, as of synth (default ubo81)"
     )
     parser.add_argument("--lights", metavar="SET", help="likewise")
-    parser.add_argument(
-        "--dtype", choices=("float16", "float32"), default="float16", help="of the stored values"
-    )
+    add_dtype(parser)
     parser.add_argument("--memory", type=count(1), default=2048, metavar="MIB", help="to use (default 2048)")
     parser.add_argument("--overwrite", action="store_true", help="replace a store of other settings")
-    parser.add_argument("--json", action="store_true", help="print the facts of the store as JSON")
+    add_json(parser, "the facts of the store")
 
 
-def run(args):
+def run(args: Namespace) -> int:
     """Carry the command out."""
     if args.format in ("maps", "photograph"):
         return _representation(args, output_file(args.output, ".exr"))
@@ -95,7 +97,7 @@ def run(args):
     return 0
 
 
-def _representation(args, out):
+def _representation(args: Namespace, out: Path) -> int:
     """A representation from pictures."""
     from btfref.representations.file.container import read_info, save
 

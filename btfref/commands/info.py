@@ -5,10 +5,15 @@ With --plot a picture of a sampled BTF: view × light contact sheet, one texel's
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+from btfref.commands._options import add_json
 from btfref.commands._shared import bytes_text, emit, emit_json, output_file, ranges
 from btfref.errors import InputError
+from btfref.types import Facts, PathLike
 
 #: Longer lists are counted; --json has them all.
 MOST_LISTED = 16
@@ -19,12 +24,12 @@ _BYTES = (
 )
 
 
-def add_arguments(parser):
+def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
     parser.add_argument(
         "file", metavar="FILE", help="representation (.exr), sampled BTF (.btf.zarr), measured BTF, or image"
     )
-    parser.add_argument("--json", action="store_true", help="print the facts as JSON")
+    add_json(parser, "the facts")
     parser.add_argument("--plot", metavar="OUT.png", help="draw a sampled BTF")
     parser.add_argument(
         "--texel",
@@ -34,7 +39,7 @@ def add_arguments(parser):
     )
 
 
-def run(args):
+def run(args: Namespace) -> int:
     """Carry the command out."""
     plot = output_file(args.plot, ".png") if args.plot else None
     if args.texel is not None and (plot is None or len(args.texel) != 2):
@@ -56,7 +61,7 @@ def run(args):
     return 0
 
 
-def read(path):
+def read(path: PathLike) -> Facts:
     """Facts about a file, whatever its kind.
 
     Returns
@@ -87,7 +92,7 @@ def read(path):
     return read_info(path)
 
 
-def _measured(path):
+def _measured(path: Path) -> Facts | None:
     """Facts about a measured BTF in a format of others, or None when it is none; missing images are counted."""
     from btfref.formats import format_named, identify, open_source
 
@@ -100,7 +105,7 @@ def _measured(path):
     return open_source(path, format=name, **missing).info()
 
 
-def _headers(path):
+def _headers(path: Path) -> list[Facts] | None:
     """Headers of an OpenEXR file, or None when it cannot be read as one."""
     if not path.is_file() or path.stat().st_size == 0:
         return None
@@ -113,7 +118,7 @@ def _headers(path):
         return None
 
 
-def _plain_exr(path):
+def _plain_exr(path: Path) -> bool:
     """Whether this is an OpenEXR image rather than a representation; broken files count as the latter."""
     from btfref.representations.file.container import ATTRIBUTE
 
@@ -121,8 +126,8 @@ def _plain_exr(path):
     return headers is not None and ATTRIBUTE not in headers[0]
 
 
-def _exr(path):
-    headers = _headers(path)
+def _exr(path: Path) -> Facts:
+    headers = _headers(path) or []
     low, high = (corner.tolist() for corner in headers[0]["dataWindow"])
     return {
         "kind": "image",
@@ -133,7 +138,7 @@ def _exr(path):
     }
 
 
-def _png(path):
+def _png(path: Path) -> Facts:
     from PIL import Image, UnidentifiedImageError
 
     try:
@@ -146,7 +151,7 @@ def _png(path):
     return {"kind": "image", "size": size, "channels": channels, "file_bytes": path.stat().st_size}
 
 
-def lines(facts, indent=""):
+def lines(facts: Facts, indent: str = "") -> Iterator[str]:
     """Facts as aligned ``key  value`` lines; nested ones are indented."""
     width = max(len(key) for key in facts)
     for key, fact in facts.items():
@@ -159,12 +164,12 @@ def lines(facts, indent=""):
             yield f"{indent}{key:<{width}}  {_text(key, fact)}"
 
 
-def _short(fact):
+def _short(fact: Facts) -> bool:
     """Whether a nested fact (a map, a direction set) fits one line."""
     return set(fact) in ({"dtype", "shape", "bytes"}, {"name", "count"})
 
 
-def _text(key, fact):
+def _text(key: str, fact: Any) -> str:
     if isinstance(fact, dict) and fact:
         shape = fact.get("shape")
         size = f", {bytes_text(fact['bytes'])}" if shape else ""

@@ -10,37 +10,26 @@ methods whose texels share tables (lpca); "transfer", these after transfer throu
 
 from __future__ import annotations
 
-from btfref.commands._shared import (
-    assignments,
-    count,
-    emit,
-    emit_json,
-    output_file,
-    size,
-    write_images,
-)
+from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from btfref.commands._images import write_images
+from btfref.commands._options import add_grid, add_image, add_json, add_keep, add_scene, help_with_scenes
+from btfref.commands._shared import assignments, count, emit, emit_json, output_file
 from btfref.errors import InputError
 from btfref.rendering.environment_light.ways import PATHS
-from btfref.scene.shipped import scene_file
+
+if TYPE_CHECKING:
+    from btfref.rendering.environment_light.transfer import TransferSettings
 
 
-def add_arguments(parser):
+def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
-    parser.add_argument(
-        "scene", metavar="SCENE", help="scene file, or plane, sphere, cloth, bowl, horizon, turning"
-    )
-    parser.add_argument("-o", "--output", required=True, metavar="X.exr", help="the image to write")
-    parser.add_argument(
-        "-D", dest="define", action="append", metavar="KEY=VALUE", help="parameter of the scene"
-    )
-    parser.add_argument("--grid", type=count(1), default=4, metavar="N", help="N × N sub-pixels (default 4)")
-    parser.add_argument("--size", type=size, metavar="WxH", help="of the image, in pixels")
-    parser.add_argument(
-        "--keep",
-        choices=("all", "needed"),
-        default="all",
-        help="maps to load: all, or those that the camera's first hits need",
-    )
+    add_scene(parser)
+    add_image(parser)
+    add_grid(parser)
+    add_keep(parser)
     parser.add_argument(
         "--environment", choices=PATHS, default="auto", help="how an envmap lights (default auto)"
     )
@@ -61,11 +50,15 @@ def add_arguments(parser):
         metavar="KEY=VALUE",
         help="clusters, components, shadows (0 or 1), bounces, bits (8 or 32) and map_size of the transfer",
     )
-    parser.add_argument("--png", action="store_true", help="also write X.png, for eyes")
-    parser.add_argument("--json", action="store_true", help="print frame time and OpenGL renderer as JSON")
+    add_json(parser, "frame time and OpenGL renderer")
 
 
-def transfer_settings(items):
+def help_text(parser: ArgumentParser, args: Namespace) -> str:
+    """Help of the command, with what ships."""
+    return help_with_scenes(parser)
+
+
+def transfer_settings(items: Sequence[str]) -> TransferSettings:
     """``KEY=VALUE`` as :class:`btfref.rendering.environment_light.transfer.TransferSettings`."""
     from dataclasses import fields
 
@@ -83,16 +76,14 @@ def transfer_settings(items):
     return TransferSettings(**given)
 
 
-def run(args):
+def run(args: Namespace) -> int:
     """Carry the command out."""
-    scene, out = scene_file(args.scene), output_file(args.output, ".exr")
-    parameters = assignments(args.define, convert=str, option="-D")
+    import btfref
 
-    from btfref.rendering.gl.renderer import realtime
-
-    result = realtime(
-        scene,
-        parameters=parameters,
+    out = output_file(args.output, ".exr")
+    result = btfref.realtime(
+        args.scene,
+        parameters=assignments(args.define, convert=str, option="-D"),
         grid=args.grid,
         size=args.size,
         keep=args.keep,
@@ -109,7 +100,7 @@ def run(args):
         meta = result.meta
         emit(f"{out}: {meta['frame_ms']:.3g} ms a frame on {meta['gl_renderer']}")
         if "estimated_error" in meta:
-            count = meta.get("environment_lights", meta.get("order"))
+            number = meta.get("environment_lights", meta.get("order"))
             kind = "lights" if "environment_lights" in meta else "bands"
-            emit(f"environment: {count} {kind}, estimated error {100 * meta['estimated_error']:.2g} %")
+            emit(f"environment: {number} {kind}, estimated error {100 * meta['estimated_error']:.2g} %")
     return 0

@@ -10,31 +10,31 @@ a command that shows it alone. Exit status 1 when anything failed.
 
 from __future__ import annotations
 
-from btfref.commands._shared import Progress, count, emit, emit_json, output_file
+from argparse import ArgumentParser, Namespace
+
+from btfref.commands._options import add_json, add_only, add_seed, words
+from btfref.commands._shared import Progress, emit, emit_json, output_file
 from btfref.errors import InputError
 
 
-def add_arguments(parser):
+def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
-    parser.add_argument("--only", metavar="METHOD[,METHOD]", help="these methods instead of all")
+    add_only(parser)
     parser.add_argument("--data", metavar="NAME[,NAME]", help="these data only, and lookups only")
     parser.add_argument("--evaluator", metavar="NAME[,NAME]", help="these ports only")
     parser.add_argument("--long", action="store_true", help="all ports on all data: more than 10⁶ lookups")
-    parser.add_argument("--seed", type=count(0), default=0, metavar="N")
+    add_seed(parser)
     parser.add_argument(
         "--case", metavar="BLOCK:INDEX:SIZE", help="show this lookup alone, as a reproducer says"
     )
     parser.add_argument("--storage", metavar="NAME", help="of the fit, with --case")
     parser.add_argument("-o", "--output", metavar="FILE.md", help="write the tables as Markdown")
-    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+    add_json(parser, "everything")
 
 
-def run(args):
+def run(args: Namespace) -> int:
     """Carry the command out."""
     out = output_file(args.output, ".md") if args.output else None
-
-    def words(text):
-        return text.split(",") if text else None
 
     from btfref.outputs import new_file
     from btfref.stress.runner import run as stress

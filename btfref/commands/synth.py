@@ -15,7 +15,9 @@ from __future__ import annotations
 
 import functools
 import operator
+from argparse import ArgumentParser, Namespace
 
+from btfref.commands._options import add_dtype, add_json, add_seed
 from btfref.commands._shared import (
     Progress,
     assignments,
@@ -25,20 +27,21 @@ from btfref.commands._shared import (
     emit,
     emit_json,
     memory_size,
+    number_above,
     numbers_or_file,
     output_file,
-    positive,
     ranges,
 )
 from btfref.commands.demand import add_scene_arguments, union, whole_shape
 from btfref.errors import InputError
-from btfref.sampling.settings import DTYPES, ESTIMATORS, MOST_SAMPLES, SAMPLES, SynthesisSettings
+from btfref.sampling.settings import ESTIMATORS, MOST_SAMPLES, SAMPLES, SynthesisSettings
+from btfref.types import Facts
 
 #: Options that are parameters of a user's mesh or height map.
 _OWN = ("bsdf", "albedo", "roughness", "amplitude", "tile", "up", "allow_seams")
 
 
-def add_arguments(parser):
+def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
     parser.add_argument(
         "mesostructure",
@@ -70,13 +73,13 @@ def add_arguments(parser):
     )
     parser.add_argument(
         "--target-error",
-        type=positive,
+        type=number_above(0),
         metavar="E",
         help="place samples where they are needed for this relative standard error of the whole BTF, e.g. 0.02",
     )
     parser.add_argument(
         "--texel-error",
-        type=positive,
+        type=number_above(0),
         metavar="E",
         help="and for this one at most of every texel of a view (default: no limit)",
     )
@@ -87,8 +90,8 @@ def add_arguments(parser):
         metavar="N",
         help="as Mitsuba's (default %(default)s)",
     )
-    parser.add_argument("--seed", type=count(0), default=default.seed, metavar="N")
-    parser.add_argument("--dtype", choices=DTYPES, default=default.dtype, help="of the stored values")
+    add_seed(parser)
+    add_dtype(parser)
     parser.add_argument(
         "--set", nargs="+", action="extend", metavar="KEY=VALUE", help="parameters of the mesostructure"
     )
@@ -156,10 +159,10 @@ def add_arguments(parser):
         "--variant", default=default.variant, help="of Mitsuba (default %(default)s; cuda_ad_rgb)"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace a store of other settings")
-    parser.add_argument("--json", action="store_true", help="print the facts of the store as JSON")
+    add_json(parser, "the facts of the store")
 
 
-def run(args):
+def run(args: Namespace) -> int:
     """Carry the command out."""
     out = output_file(args.output, ".btf.zarr")
     parameters = assignments(args.set)
@@ -189,7 +192,7 @@ def run(args):
     elif args.define or args.sweep or args.indirect:
         raise InputError("these are parameters of scenes", field="-D, --sweep, --indirect", expected="--for")
 
-    peak = []
+    peak: list[int] = []
     with Progress() as progress:
         store = synthesize_store(
             out,
@@ -216,7 +219,7 @@ def run(args):
     return 0
 
 
-def error_text(error):
+def error_text(error: Facts) -> str:
     """One line on what a synthesis to a target error has reached."""
     samples = error["samples"]
     text = f"relative standard error {error['reached']:.2%} (target {error['target']:.2%})"

@@ -7,17 +7,24 @@ content: what has not changed is not computed again. Methods of installed packag
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from btfref.commands._options import add_json, add_only, words
 from btfref.commands._shared import Progress, count, emit, emit_json, number, table
 
+if TYPE_CHECKING:
+    from btfref.validate.run import Validation
 
-def add_arguments(parser):
+
+def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
     parser.add_argument(
         "--quick", action="store_true", help="one mesostructure, three views a method, small pictures"
     )
-    parser.add_argument("--only", metavar="METHOD[,METHOD]", help="these methods instead of all")
+    add_only(parser)
     parser.add_argument("--scene", metavar="SCENE[,SCENE]", help="plane, sphere, cloth, or scene files")
     parser.add_argument("--lights", metavar="LIGHTS[,LIGHTS]", help="such as directional1, points2")
     parser.add_argument("--mesostructure", metavar="NAME[,NAME]", help="such as checker, rings, tissue")
@@ -31,7 +38,7 @@ def add_arguments(parser):
         "--workers", type=count(1), metavar="N", help="processes (default: by cores and memory)"
     )
     parser.add_argument("--no-report", action="store_true", help="numbers only")
-    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    add_json(parser, "the result")
     parser.add_argument(
         "--self-test",
         action="store_true",
@@ -39,7 +46,7 @@ def add_arguments(parser):
     )
 
 
-def run(args):
+def run(args: Namespace) -> int:
     """Carry the command out."""
     if args.self_test:
         return _self_test(args)
@@ -47,10 +54,10 @@ def run(args):
     from btfref.validate.run import validate
 
     specs = select(
-        only=_names(args.only),
-        scenes=_names(args.scene),
-        lights=_names(args.lights),
-        mesostructures=_names(args.mesostructure),
+        only=words(args.only),
+        scenes=words(args.scene),
+        lights=words(args.lights),
+        mesostructures=words(args.mesostructure),
         quick=args.quick,
     )
     settings = QUICK if args.quick else FULL
@@ -71,7 +78,7 @@ def run(args):
     return 0 if result.passed else 1
 
 
-def lines(result):
+def lines(result: Validation) -> Iterator[str]:
     """The outcome for a reader: a row a method and mesostructure, what failed, what took how long."""
     from btfref.validate.summary import HEADER, additivity, rows
 
@@ -88,7 +95,7 @@ def lines(result):
     )
 
 
-def _self_test(args):
+def _self_test(args: Namespace) -> int:
     from btfref.validate.self_test import self_test
 
     with Progress() as progress:
@@ -103,7 +110,3 @@ def _self_test(args):
         for line in table(rows, header=["fault", "meant for", "by it", "gates that failed"]):
             emit(line)
     return 0 if all(fault.caught for fault in caught) else 1
-
-
-def _names(text):
-    return text.split(",") if text else None

@@ -215,7 +215,9 @@ def fit(btf, *, seed=0, progress=None, lobes=4, storage="half", filter_type="bil
     lobes : int
         Per texel, at least 1.
     storage : {"half", "float"}
+        Type of the stored maps.
     filter_type : {"bilinear", "nearest"}
+        Lookup between texels.
 
     Returns
     -------

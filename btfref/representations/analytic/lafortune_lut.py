@@ -64,7 +64,9 @@ def fit(btf, *, seed=0, progress=None, lobes=4, rounds=1, storage="half", filter
     rounds : int
         Refits of the lobes after the first fit; the factor is updated after each. At least 1.
     storage : {"half", "float"}
+        Type of the stored maps.
     filter_type : {"bilinear", "nearest"}
+        Lookup between texels.
 
     Returns
     -------

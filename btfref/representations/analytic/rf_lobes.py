@@ -16,6 +16,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from btfref.errors import InputError
 from btfref.numerics.powers import FLOOR, safe_power, unit_lobe
 from btfref.numerics.solvers.levenberg import fit_batch
 from btfref.precision import real
@@ -198,9 +199,11 @@ def fit(
     lobes : int
         Per texel and view, at least 1.
     diffuse_quantile : float
-        Quantile of luminance / l_z that becomes the diffuse albedo of a texel.
+        Quantile of luminance / l_z that becomes the diffuse albedo of a texel, [0, 1].
     storage : {"half", "float"}
+        Type of the stored maps.
     filter_type : {"bilinear", "nearest"}
+        Lookup between texels.
 
     Returns
     -------
@@ -217,6 +220,10 @@ def fit(
         Without LLVM or CUDA.
     """
     n_lobes = positive_integer("lobes", lobes)
+    if not 0 <= diffuse_quantile <= 1:
+        raise InputError(
+            "a parameter is out of range", field="diffuse_quantile", got=diffuse_quantile, expected="0 to 1"
+        )
     n_views, _, rows, columns, _ = btf.values.shape
     maps = {
         "lobes": np.zeros((rows * columns, n_views, 4 * n_lobes), np.float32),

@@ -98,7 +98,9 @@ def fit(btf, *, seed=0, progress=None, storage="half", filter_type="bilinear"):
     progress : callable, optional
         ``progress(done, total, label)``.
     storage : {"half", "float"}
+        Type of the stored maps.
     filter_type : {"bilinear", "nearest"}
+        Lookup between texels.
 
     Returns
     -------

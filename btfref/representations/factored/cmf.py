@@ -64,7 +64,7 @@ class Resampling:
     ----------
     views, lights : DirectionSet
     half_step : float
-        Degrees between samples of the half vector.
+        Degrees between samples of the half vector, [0.5, 90].
     map_size : int
     four : bool
         With the difference factor.
@@ -269,16 +269,16 @@ def factorize(
     terms : int
         Non-negative terms of each matrix decomposition, at least 1.
     sweeps : int
-        Multiplicative updates of all factors after the chain, towards the least weighted squared error of the product
-        as the maps give it. Differs from the paper, which stops after the chain (0): the residue's decomposition
-        weighs every sample of the quotient alike, however small the product is there.
+        Multiplicative updates of all factors after the chain, 0 to 1000, towards the least weighted squared error of
+        the product as the maps give it. Differs from the paper, which stops after the chain (0): the residue's
+        decomposition weighs every sample of the quotient alike, however small the product is there.
     exponent : float
-        Squared errors of the updates and of the scales count (B / mean + 0.1)^−exponent: 0 favours highlights and
-        the RMSE, 2 shadows and the relative error.
+        Squared errors of the updates and of the scales count (B / mean + 0.1)^−exponent, 0 to 2: 0 favours highlights
+        and the RMSE, 2 shadows and the relative error.
     floor : float
-        Share of its mean below which the half-vector approximation is held when the data are divided by it.
+        Share of its mean, [0, 1], below which the half-vector approximation is held when the data are divided by it.
     half_step : float
-        Degrees between samples of the half vector.
+        Degrees between samples of the half vector, [0.5, 90].
     map_size : int
         Texels along a side of a parabolic map, at least 2.
 

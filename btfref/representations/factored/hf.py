@@ -205,11 +205,11 @@ def factorize(
     step : callable
         ``step(label)``, called now and then.
     smoothness : float, optional
-        λ of the smoothing rows. None: of ``SMOOTHNESS`` the one that predicts the logarithms of a fifth of the samples
-        of some texels best from the others.
+        λ of the smoothing rows, above 0. None: of ``SMOOTHNESS`` the one that predicts the logarithms of a fifth of
+        the samples of some texels best from the others.
     floor : float
-        Share of its mean below which a texel's value counts as that much: logarithms need positive numbers, and
-        without a floor the least values would rule the fit. A black texel stays black.
+        Share of its mean, (0, 1], below which a texel's value counts as that much: logarithms need positive numbers,
+        and without a floor the least values would rule the fit. A black texel stays black.
     bounded : bool
         Texels of a map that no sample reaches, which the smoothing extrapolates, hold at most the largest value of
         those that one reaches. Differs from the papers (False): what no sample sees is up to 7 times as large, and

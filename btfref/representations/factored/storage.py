@@ -45,7 +45,7 @@ class Storing:
     Attributes
     ----------
     clusters : int or None
-        Largest codebook of each factor; None: no clustering.
+        Largest codebook of each factor, at least 1; None: no clustering.
     storage : {"half", "float", "byte"}
         Type of the maps.
     scale_storage : {"half", "float", "byte"} or None
@@ -56,6 +56,7 @@ class Storing:
     rescale : bool
         Fit the scales to the data again, by weighted least squares, with the stored maps in place.
     filter_type : {"bilinear", "nearest"}
+        Lookup between texels.
 
     Raises
     ------
@@ -200,7 +201,7 @@ def cluster(factors, clusters, *, seed=0, step=lambda label: None):
     ----------
     factors : btfref.representations.factored.fit.Factors
     clusters : int or None
-        Largest codebook of each factor; None: no clustering.
+        Largest codebook of each factor, at least 1; None: no clustering.
     seed : int
     step : callable
         ``step(label)``, called for each factor.

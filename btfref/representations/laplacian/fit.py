@@ -55,11 +55,12 @@ def fit(
     progress : callable, optional
         ``progress(done, total, label)``.
     levels : int, optional
-        λ_max + 1; default: down to one texel.
+        λ_max + 1, at least 1; default: down to one texel.
     components : three int, or one for all
         Of Y, Cb and Cr at each level, at least 0; no more than a level's texels are kept.
     target_error : float, optional
-        In place of ``components``: as few as keep the relative RMS error of each level's images, as RGB, at most this.
+        In place of ``components``: as few as keep the relative RMS error of each level's images, as RGB, at most this,
+        (0, 1).
     mean : {"auto", "phong", "stored"}
         Of the coarsest level. "auto": Phong and constants where they fit to ``PHONG_LIMIT``.
     reduction : {"binomial", "box"}
@@ -69,6 +70,7 @@ def fit(
     directions : {"interpolated", "nearest"}
         Between measured directions.
     storage : {"half", "float"}
+        Type of the stored maps.
     filter_type : {"bilinear", "nearest"}, optional
         Lookup between texels, and expansion of the levels; default "nearest" for the box, else "bilinear".
 

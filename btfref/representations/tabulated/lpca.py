@@ -141,6 +141,7 @@ def fit(btf, *, seed=0, progress=None, clusters=16, components=4, storage="half"
     storage : {"half", "float"}
         Type of the stored maps; ``evaluate`` and the ports use the stored values.
     filter_type : {"bilinear", "nearest"}
+        Lookup between texels.
 
     Returns
     -------

@@ -70,7 +70,7 @@ def fit(btf, *, seed=0, progress=None, filter_type="bilinear"):
     progress : callable, optional
         Unused: the copy takes no noticeable time.
     filter_type : {"bilinear", "nearest"}
-        Texel filter that :meth:`Representation.evaluate` and the ports use.
+        Lookup between texels.
 
     Raises
     ------

@@ -78,7 +78,9 @@ def fit(btf, *, seed=0, progress=None, components=16, storage="half", filter_typ
     components : int
         At least 1; no more than texels are kept.
     storage : {"half", "float"}
+        Type of the stored maps.
     filter_type : {"bilinear", "nearest"}
+        Lookup between texels.
 
     Returns
     -------

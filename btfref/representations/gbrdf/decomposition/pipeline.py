@@ -61,28 +61,31 @@ def fit(
     depth : float
         Tile units below z = 0 in which heights are looked for, (0, 4].
     layers : int
-        Candidate heights.
+        Candidate heights, at least 1.
     pairs : int
-        Reciprocal pairs of images that take part.
+        Reciprocal pairs of images that take part, at least 1.
     window : int
-        Side of the correlation window in texels.
+        Side of the correlation window in texels, at least 1.
     similarity : {"reciprocity", "correlation"}
         What heights are told by: how well one normal explains all reciprocal pairs of a texel, or the paper's
         correlation of windows (eq. 5). On the checker, whose squares have no texture inside, the heights of the latter
         are four times as wrong.
     smoothness : float
-        Of the minimum cut; see `btfref.representations.gbrdf.decomposition.heights.minimum_cut`.
+        Of the minimum cut, at least 0; see `btfref.representations.gbrdf.decomposition.heights.minimum_cut`.
     depth_weight : float
         λ of the fusion of heights and normals, (0, 1].
     materials : int, optional
-        Number of materials; default: by the separation index, at most ``largest``.
+        Number of materials, at least 1; default: by the separation index, at most ``largest``.
     largest : int
+        Most materials that the separation index may choose, at least 1.
     ndf_size : int
         Texels per side of the distributions, a power of two.
     iterations : int
-        Alternations of the materials' least squares.
+        Alternations of the materials' least squares, at least 1.
     storage : {"half", "float"}
+        Type of the stored maps.
     filter_type : {"bilinear", "nearest"}
+        Lookup between texels.
     intermediates : path-like or dict, optional
         An ``.npz`` file, or a dictionary, for the maps of every stage: ``similarity`` (layers, rows, columns),
         ``layers``, ``cut`` and ``fused`` heights in tile units, ``slopes`` of the normals, ``texel_diffuse``,
