@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 
 from btfref.bench import SUITES
 from btfref.bench.plan import SUFFIX, shipped
-from btfref.commands._options import add_json, add_only, words
-from btfref.commands._shared import Progress, emit, emit_json, output_file, table
+from btfref.commands.shared.options import add_json, add_only, words
+from btfref.commands.shared.printing import Progress, emit, emit_json, table
+from btfref.commands.shared.reading import output_file
 from btfref.errors import InputError
 from btfref.types import Facts
 

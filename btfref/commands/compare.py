@@ -16,16 +16,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from btfref.commands._images import load_classes
-from btfref.commands._options import add_define, add_grid, add_json, add_size
-from btfref.commands._shared import (
-    assignments,
-    emit,
-    emit_json,
-    number,
-    output_file,
-    table,
-)
+from btfref.commands.shared.images import load_classes
+from btfref.commands.shared.options import add_define, add_grid, add_json, add_size
+from btfref.commands.shared.printing import emit, emit_json, number, table
+from btfref.commands.shared.reading import assignments, output_file
 from btfref.errors import InputError
 
 if TYPE_CHECKING:

@@ -15,17 +15,9 @@ from argparse import ArgumentParser, Namespace, _ActionsContainer
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from btfref.commands._options import add_define, add_grid, add_json, add_size, help_with_scenes
-from btfref.commands._shared import (
-    Progress,
-    assignments,
-    count,
-    direction_set,
-    emit,
-    emit_json,
-    number_above,
-    table,
-)
+from btfref.commands.shared.options import add_define, add_grid, add_json, add_size, help_with_scenes
+from btfref.commands.shared.printing import Progress, emit, emit_json, table
+from btfref.commands.shared.reading import assignments, count, direction_set, number_above
 from btfref.errors import InputError
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from btfref.commands._options import add_json
-from btfref.commands._shared import Progress, emit, emit_json, number, table
+from btfref.commands.shared.options import add_json
+from btfref.commands.shared.printing import Progress, emit, emit_json, number, table
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -11,8 +11,8 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from btfref.commands._options import add_json
-from btfref.commands._shared import bytes_text, emit, emit_json
+from btfref.commands.shared.options import add_json
+from btfref.commands.shared.printing import bytes_text, emit, emit_json
 from btfref.errors import MissingDependencyError
 
 if TYPE_CHECKING:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from btfref.commands._options import add_json
-from btfref.commands._shared import Progress, count, emit, emit_json, number, number_above, output_file
+from btfref.commands.shared.options import add_json
+from btfref.commands.shared.printing import Progress, emit, emit_json, number
+from btfref.commands.shared.reading import count, number_above, output_file
 from btfref.errors import InputError
 
 #: Option -> what it is called in the library, where that differs.

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from btfref.commands._options import add_json, add_seed
-from btfref.commands._shared import Progress, assignments, bytes_text, emit, emit_json, output_file
+from btfref.commands.shared.options import add_json, add_seed
+from btfref.commands.shared.printing import Progress, bytes_text, emit, emit_json
+from btfref.commands.shared.reading import assignments, output_file
 from btfref.errors import InputError
 
 
@@ -40,12 +41,12 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def help_text(parser: ArgumentParser, args: Namespace) -> str:
     """Help of the command with all methods, or of the method that stands before ``--help``."""
-    from btfref.commands import _method_help
+    from btfref.commands.shared import method_help
     from btfref.registry import method
 
     if args.method:
-        return _method_help.method_help(method(args.method))
-    return "\n".join([parser.format_help(), *_method_help.methods_help()])
+        return method_help.method_help(method(args.method))
+    return "\n".join([parser.format_help(), *method_help.methods_help()])
 
 
 def run(args: Namespace) -> int:

@@ -10,17 +10,9 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from btfref.commands._options import add_dtype, add_json
-from btfref.commands._shared import (
-    Progress,
-    bytes_text,
-    count,
-    direction_set,
-    emit,
-    emit_json,
-    number_above,
-    output_file,
-)
+from btfref.commands.shared.options import add_dtype, add_json
+from btfref.commands.shared.printing import Progress, bytes_text, emit, emit_json
+from btfref.commands.shared.reading import count, direction_set, number_above, output_file
 
 
 def add_arguments(parser: ArgumentParser) -> None:

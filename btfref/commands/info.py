@@ -10,8 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from btfref.commands._options import add_json
-from btfref.commands._shared import bytes_text, emit, emit_json, output_file, ranges
+from btfref.commands.shared.options import add_json
+from btfref.commands.shared.printing import bytes_text, emit, emit_json
+from btfref.commands.shared.reading import output_file, ranges
 from btfref.errors import InputError
 from btfref.types import Facts, PathLike
 

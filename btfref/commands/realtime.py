@@ -14,9 +14,17 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from btfref.commands._images import write_images
-from btfref.commands._options import add_grid, add_image, add_json, add_keep, add_scene, help_with_scenes
-from btfref.commands._shared import assignments, count, emit, emit_json, output_file
+from btfref.commands.shared.images import write_images
+from btfref.commands.shared.options import (
+    add_grid,
+    add_image,
+    add_json,
+    add_keep,
+    add_scene,
+    help_with_scenes,
+)
+from btfref.commands.shared.printing import emit, emit_json
+from btfref.commands.shared.reading import assignments, count, output_file
 from btfref.errors import InputError
 from btfref.rendering.environment_light.ways import PATHS
 

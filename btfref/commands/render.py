@@ -11,9 +11,17 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from btfref.commands._images import write_images
-from btfref.commands._options import add_grid, add_image, add_keep, add_scene, add_seed, help_with_scenes
-from btfref.commands._shared import assignments, count, emit, output_file
+from btfref.commands.shared.images import write_images
+from btfref.commands.shared.options import (
+    add_grid,
+    add_image,
+    add_keep,
+    add_scene,
+    add_seed,
+    help_with_scenes,
+)
+from btfref.commands.shared.printing import emit
+from btfref.commands.shared.reading import assignments, count, output_file
 from btfref.errors import InputError
 
 

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from btfref.commands._options import add_json, add_only, add_seed, words
-from btfref.commands._shared import Progress, emit, emit_json, output_file
+from btfref.commands.shared.options import add_json, add_only, add_seed, words
+from btfref.commands.shared.printing import Progress, emit, emit_json
+from btfref.commands.shared.reading import output_file
 from btfref.errors import InputError
 
 

@@ -17,22 +17,19 @@ import functools
 import operator
 from argparse import ArgumentParser, Namespace
 
-from btfref.commands._options import add_dtype, add_json, add_seed
-from btfref.commands._shared import (
-    Progress,
+from btfref.commands.demand import add_scene_arguments, union, whole_shape
+from btfref.commands.shared.options import add_dtype, add_json, add_seed
+from btfref.commands.shared.printing import Progress, bytes_text, emit, emit_json
+from btfref.commands.shared.reading import (
     assignments,
-    bytes_text,
     count,
     direction_set,
-    emit,
-    emit_json,
     memory_size,
     number_above,
     numbers_or_file,
     output_file,
     ranges,
 )
-from btfref.commands.demand import add_scene_arguments, union, whole_shape
 from btfref.errors import InputError
 from btfref.sampling.settings import ESTIMATORS, MOST_SAMPLES, SAMPLES, SynthesisSettings
 from btfref.types import Facts

@@ -12,8 +12,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from btfref.commands._options import add_json, add_only, words
-from btfref.commands._shared import Progress, count, emit, emit_json, number, table
+from btfref.commands.shared.options import add_json, add_only, words
+from btfref.commands.shared.printing import Progress, emit, emit_json, number, table
+from btfref.commands.shared.reading import count
 
 if TYPE_CHECKING:
     from btfref.validate.run import Validation

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from btfref.cli import build_parser, main
-from btfref.commands import COMMANDS, _images, _shared
+from btfref.commands import COMMANDS
+from btfref.commands.shared import images, printing, reading
 from btfref.errors import BtfrefError, InputError, MissingDependencyError
 from btfref.gates import tolerance
 from btfref.numerics.sphere.directions import directions
@@ -164,15 +165,15 @@ def test_a_reader_that_leaves_is_no_error():
 def test_assignments_read_json_where_it_is_json():
     given = ["a=1", "b=0.5", "c=true", "d=text", "e=[1, 2]", "f=x=y", "g="]
     expected = {"a": 1, "b": 0.5, "c": True, "d": "text", "e": [1, 2], "f": "x=y", "g": ""}
-    assert _shared.assignments(given) == expected
-    assert _shared.assignments(["a=1"], convert=str) == {"a": "1"}
-    assert _shared.assignments(None) == {}
+    assert reading.assignments(given) == expected
+    assert reading.assignments(["a=1"], convert=str) == {"a": "1"}
+    assert reading.assignments(None) == {}
 
 
 @pytest.mark.parametrize("items", [["a"], ["=1"], ["a b=1"], ["a=1", "a=2"]])
 def test_assignments_refuse(items):
     with pytest.raises(InputError, match="--set"):
-        _shared.assignments(items)
+        reading.assignments(items)
 
 
 def test_direction_files_are_in_degrees(tmp_path):
@@ -180,9 +181,9 @@ def test_direction_files_are_in_degrees(tmp_path):
     path = tmp_path / "set.csv"
     rows = [f"{theta:.12f}, {phi:.12f}" for theta, phi in np.rad2deg([ubo.theta, ubo.phi]).T]
     path.write_text("# theta, phi\n" + "\n".join(rows) + "\n\n")
-    read = directions(_shared.direction_set(str(path)))
+    read = directions(reading.direction_set(str(path)))
     np.testing.assert_array_equal(np.round(read.vectors - ubo.vectors, 9), 0)
-    assert _shared.direction_set("10x5") == "10x5"
+    assert reading.direction_set("10x5") == "10x5"
 
 
 @pytest.mark.parametrize("text", ["", "1 2\n3\n", "1 2 3\n", "a b\n", "nan 0\n"])
@@ -190,25 +191,25 @@ def test_bad_direction_files(text, tmp_path):
     path = tmp_path / "set.txt"
     path.write_text(text)
     with pytest.raises(InputError, match=r"set\.txt"):
-        _shared.direction_set(str(path))
+        reading.direction_set(str(path))
 
 
 def test_tables_align():
-    lines = _shared.table([["a", "1.5"], ["long", "12"]], header=["", "n"])
+    lines = printing.table([["a", "1.5"], ["long", "12"]], header=["", "n"])
     assert lines == ["        n", "────  ───", "a     1.5", "long   12"]
-    assert _shared.table([]) == []
+    assert printing.table([]) == []
 
 
 def test_bytes_for_readers():
-    assert _shared.bytes_text(1000) == "1 000 bytes"
-    assert _shared.bytes_text(17694720) == "16.9 MiB (17 694 720 bytes)"
+    assert printing.bytes_text(1000) == "1 000 bytes"
+    assert printing.bytes_text(17694720) == "16.9 MiB (17 694 720 bytes)"
 
 
 @pytest.mark.parametrize(("delay", "labels"), [(2.0, []), (0.0, ["one", "two"])])
 def test_progress_bar_waits_and_follows_labels(delay, labels, capsys, monkeypatch):
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
-    monkeypatch.setattr(_shared.Progress, "delay", delay)
-    with _shared.Progress() as progress:
+    monkeypatch.setattr(printing.Progress, "delay", delay)
+    with printing.Progress() as progress:
         for label in ("one", "two"):
             for done in range(4):
                 progress(done, 3, label)
@@ -218,8 +219,8 @@ def test_progress_bar_waits_and_follows_labels(delay, labels, capsys, monkeypatc
 
 def test_classes_survive_a_file(tmp_path):
     classes = np.arange(12, dtype=np.uint8).reshape(3, 4) % 3
-    _images.save_classes(tmp_path / "c.png", classes)
-    np.testing.assert_array_equal(_images.load_classes(tmp_path / "c.png"), classes)
+    images.save_classes(tmp_path / "c.png", classes)
+    np.testing.assert_array_equal(images.load_classes(tmp_path / "c.png"), classes)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["c.png"]
 
 
@@ -320,7 +321,7 @@ def test_compare_prints_gates_and_decides(tmp_path, capsys):
     assert main(["compare", c, a, "--gate", "image.noise_free", "--json"]) == 1
     facts = json.loads(capsys.readouterr().out)
     assert not facts["passed"]
-    _images.save_classes(tmp_path / "k.png", np.zeros((16, 16), np.uint8))
+    images.save_classes(tmp_path / "k.png", np.zeros((16, 16), np.uint8))
     assert main(["compare", b, a, "--classes", str(tmp_path / "k.png"), "--gate", "image.noise_free"]) == 1
 
 

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from btfref.cli import main
-from btfref.commands import _method_help
+from btfref.commands.shared import method_help
 from btfref.registry import Method, methods
 from btfref.scene.shipped import ENVIRONMENTS, lights, names
 
@@ -30,9 +30,9 @@ def test_fit_lists_the_methods(capsys):
 def test_a_method_explains_its_parameters_and_presets(key, capsys):
     row = methods()[key]
     text = shown(capsys, "fit", key)
-    documented = _method_help.parameters_of(row.fit)
+    documented = method_help.parameters_of(row.fit)
     for name, default in row.parameters.items():
-        assert f"  {name}={_method_help.typed(default)}" in text
+        assert f"  {name}={method_help.typed(default)}" in text
         kind, meaning = documented[name]
         assert kind
         assert meaning
@@ -41,7 +41,7 @@ def test_a_method_explains_its_parameters_and_presets(key, capsys):
         assert "see " not in meaning.lower() or "`btfref" in meaning
     for name, values in row.presets.items():
         assert f"  {name}" in text
-        assert all(f"{key}={_method_help.typed(value)}" in text for key, value in values.items())
+        assert all(f"{key}={method_help.typed(value)}" in text for key, value in values.items())
 
 
 def test_an_unknown_method_is_one_line(capsys):
@@ -86,7 +86,7 @@ def test_methods_of_others_are_explained_as_far_as_they_are_documented(monkeypat
     row = Method("foreign", "A title", "a paper", module=__name__, plugin="", shader="")
     monkeypatch.setitem(globals(), "fit", foreign_fit)
     monkeypatch.setitem(globals(), "PRESETS", {"paper": {"terms": (3, 4), "note": "y"}, "plain": {}})
-    lines = _method_help.method_help(row).splitlines()
+    lines = method_help.method_help(row).splitlines()
     assert lines[2] == "A title; a paper"
     assert "More on it." in lines
     assert "  terms=[1,2]  two int. How many; see other." in lines

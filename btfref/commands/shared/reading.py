@@ -1,10 +1,9 @@
-"""What several commands share: reading arguments, progress bars, printing."""
+"""Arguments as the commands read them: numbers, sizes, parameters, directions, names of outputs."""
 
 from __future__ import annotations
 
 import json
 import re
-import sys
 from argparse import ArgumentTypeError
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -15,27 +14,6 @@ from btfref.types import PathLike
 
 if TYPE_CHECKING:
     import numpy as np
-
-
-def emit(text: str = "", *, flush: bool = False) -> None:
-    """Write one line to standard output; `flush` before work that takes long or writes by itself."""
-    sys.stdout.write(f"{text}\n")
-    if flush:
-        sys.stdout.flush()
-
-
-def emit_json(data: object) -> None:
-    """Write `data` to standard output as indented JSON."""
-    emit(json.dumps(data, indent=2, ensure_ascii=False, default=_plain))
-
-
-def _plain(value: Any) -> object:
-    """NumPy scalars and arrays and paths as what JSON knows."""
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    if isinstance(value, Path):
-        return str(value)
-    raise TypeError(f"cannot write {type(value).__name__} as JSON")
 
 
 def value(text: str) -> Any:
@@ -176,80 +154,3 @@ def output_file(text: PathLike, *suffixes: str) -> Path:
     if not path.parent.is_dir():
         raise InputError("cannot write there", file=text, got="no such folder")
     return path
-
-
-class Progress:
-    """A progress bar on standard error that appears once the work has taken two seconds.
-
-    Call it as ``progress(done, total, label)``; use it as a context manager so that the bar ends cleanly.
-    """
-
-    #: Seconds before a bar is worth showing.
-    delay = 2.0
-
-    def __init__(self) -> None:
-        self._bar: Any = None  # tqdm, which carries no types
-
-    def __enter__(self) -> Progress:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.close()
-
-    def __call__(self, done: int, total: int, label: str = "") -> None:
-        from tqdm import tqdm
-
-        if self._bar is None or self._bar.desc != f"{label}: " or self._bar.total != total:
-            if self._bar is not None:
-                self._bar.close()
-            # disable=None: no bar where nobody looks (standard error is a file or a pipe).
-            self._bar = tqdm(
-                desc=label, total=total, delay=self.delay, leave=False, disable=None, file=sys.stderr
-            )
-            self._bar.desc = f"{label}: "
-        self._bar.update(done - self._bar.n)
-
-
-def table(rows: Iterable[Iterable[object]], *, header: Iterable[object] | None = None) -> list[str]:
-    """Rows of cells as aligned lines; numbers to the right, text to the left."""
-    body = [[str(cell) for cell in row] for row in rows]
-    every = [*([[str(cell) for cell in header]] if header else []), *body]
-    if not every:
-        return []
-    widths = [max(len(row[column]) for row in every) for column in range(len(every[0]))]
-    right = [all(_numeric(row[column]) for row in body) for column in range(len(every[0]))]
-    lines = [
-        "  ".join(
-            cell.rjust(width) if flag else cell.ljust(width)
-            for cell, width, flag in zip(row, widths, right, strict=True)
-        ).rstrip()
-        for row in every
-    ]
-    if header:
-        lines.insert(1, "  ".join("─" * width for width in widths))
-    return lines
-
-
-def _numeric(text: str) -> bool:
-    return not text or text[0].isdigit() or text[0] in "-+–.∞"
-
-
-def number(value: float | str | None) -> str:
-    """A metric for a reader: four significant digits, a dash for none."""
-    if value is None:
-        return "–"
-    if isinstance(value, bool | str):
-        return str(value)
-    return f"{value:.4g}"
-
-
-def bytes_text(n: float) -> str:
-    """A number of bytes for a reader: ``1.9 MiB (2 012 345 bytes)``."""
-    amount, unit = float(n), "bytes"
-    for unit in ("bytes", "KiB", "MiB", "GiB", "TiB"):
-        if amount < 1024 or unit == "TiB":
-            break
-        amount /= 1024
-    exact = f"{int(n):,} bytes".replace(",", " ")
-    return exact if unit == "bytes" else f"{amount:.3g} {unit} ({exact})"

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from importlib import import_module
 from typing import Any
 
-from btfref.commands._options import WIDTH, entries
+from btfref.commands.shared.options import WIDTH, entries
 from btfref.registry import Method, methods
 
 #: How a docstring says that another one describes a parameter.

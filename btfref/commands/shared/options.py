@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from argparse import ArgumentParser, _ActionsContainer
 
-from btfref.commands._shared import count, size
+from btfref.commands.shared.reading import count, size
 from btfref.sampling.settings import DTYPES
 from btfref.scene.shipped import ENVIRONMENTS, described, lights, names
 

@@ -1,0 +1,1 @@
+"""What several commands share: reading arguments, printing, images, options, help of methods."""
