@@ -142,10 +142,11 @@ def _fill(
 ) -> None:
     """Write the views that are not there yet."""
     n_lights, tiles = len(source.lights), store.coverage.shape[2:]
-    covered = (store.coverage.all(axis=(2, 3)) | ~source.present).all(axis=1)
+    covered = np.all(store.coverage.all(axis=(2, 3)) | ~source.present, axis=1)
     views = np.flatnonzero(source.present.any(axis=1))
     done = int(covered[views].sum())
-    every = [index.ravel() for index in np.indices(tiles)]
+    rows, columns = np.indices(tiles)
+    every = rows.ravel(), columns.ravel()
     for view in views[~covered[views]]:
         view = int(view)
         values = np.zeros((n_lights, *source.texels, 3), store.dtype)

@@ -85,7 +85,7 @@ def import_maps(folder: PathLike) -> Representation:
 
     path = Path(folder) / "maps.toml"
     try:
-        key = tomllib.loads(path.read_text(encoding="utf-8")).get("method")
+        key = str(tomllib.loads(path.read_text(encoding="utf-8")).get("method", ""))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError("cannot read the scalars", file=path, got=error) from error
     row = method(key, file=path)
