@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 
 from btfref import platform, system
-from btfref.provenance import versions
+from btfref.provenance import RELEVANT, versions
 
 #: Mitsuba variants that btfref uses, and whether it can do without.
 VARIANTS = {"llvm_ad_rgb": True, "scalar_rgb": True, "cuda_ad_rgb": False}
@@ -188,7 +188,7 @@ def examine():
         A few seconds; each probe runs beside the others in a process of its own.
     """
     llvm = platform.choose_llvm()
-    installed = versions()
+    installed = versions(RELEVANT)  # LLVM has checks of its own
     with ThreadPoolExecutor() as pool:
         waiting = {
             name: pool.submit(probe, _MITSUBA_PROBE, name, environment=_llvm_environment(llvm))

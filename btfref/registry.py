@@ -22,6 +22,12 @@ if TYPE_CHECKING:
 ENTRY_POINT_GROUP = "btfref.representations"
 
 
+def imported(place: str) -> Any:
+    """What ``module:object`` names."""
+    module, _, name = place.partition(":")
+    return getattr(import_module(module), name)
+
+
 @dataclass(frozen=True)
 class Catalogue:
     """btfref's own rows, and those of an entry-point group.
@@ -54,8 +60,7 @@ class Catalogue:
             When there is none.
         """
         if name in self.rows:
-            module, _, attribute = self.rows[name].partition(":")
-            return getattr(import_module(module), attribute)
+            return imported(self.rows[name])
         for point in entry_points(group=self.group, name=name):
             return point.load()
         raise InputError(
@@ -308,5 +313,4 @@ def image_light(key: str, *, file: PathLike | None = None) -> type[Any]:
             got=key,
             expected=f"one of {having}",
         )
-    module, _, name = row.image_light.partition(":")
-    return getattr(import_module(module), name)
+    return imported(row.image_light)

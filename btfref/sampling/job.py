@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import importlib
 import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -16,6 +15,7 @@ from btfref.errors import InputError
 from btfref.mesostructure import build
 from btfref.mesostructure.materials import load_bsdf
 from btfref.provenance import LLVM, versions
+from btfref.registry import imported
 from btfref.sampling.fallback import reason_against_surface
 from btfref.sampling.paths import adaptive
 from btfref.sampling.scheduling import run
@@ -117,8 +117,7 @@ class Job:
         """
         settings = self.settings
         options: dict[str, Any] = {}
-        module, _, name = ESTIMATORS[settings.estimator].partition(":")
-        make = getattr(importlib.import_module(module), name)
+        make = imported(ESTIMATORS[settings.estimator])
         seed = settings.seed
         if stream is not None:
             seed = int(np.random.SeedSequence([seed, *stream]).generate_state(1, np.uint64)[0] >> 2)

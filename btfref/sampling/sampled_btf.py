@@ -22,7 +22,7 @@ from btfref.types import Facts
 UNIT_TOLERANCE = 1e-3
 
 if TYPE_CHECKING:
-    from btfref.sampling.store.store import Choice
+    from btfref.sampling.store.arrays import Choice
     from btfref.types import PathLike
 
 

@@ -191,6 +191,7 @@ def _cell(cache, spec, settings):
         "frame_ms": image.meta["frame_ms"],
         "negative_fraction": image.meta["negative_fraction"],
         "gl_renderer": image.meta["gl_renderer"],
+        "gl_version": image.meta["gl_version"],
         "notes": f"{found.explanation} Both renderers read one file and one scene; neither casts shadows.",
         **facts,
     }

@@ -6,7 +6,7 @@ import os
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
 
@@ -14,8 +14,9 @@ from btfref.conventions import in_one_line
 from btfref.errors import InputError
 from btfref.numerics.sphere.directions import checked
 from btfref.outputs import refuse_existing, require_folder_of
-from btfref.sampling.paths.adaptive import summary
-from btfref.sampling.store.layout import DRAFT, KIND, TILE, attributes_of, check_finite, write_headers
+from btfref.sampling.store.arrays import Choice, StoredArray, along_axis
+from btfref.sampling.store.facts import store_facts
+from btfref.sampling.store.layout import DRAFT, TILE, attributes_of, check_finite, write_headers
 
 if TYPE_CHECKING:
     from zarr.storage import StoreLike
@@ -23,25 +24,7 @@ if TYPE_CHECKING:
     from btfref.numerics.sphere.directions import DirectionSet
     from btfref.types import Facts, PathLike
 
-
-#: What of an axis is read: all, one, a slice, or a list of indices.
-Choice: TypeAlias = "int | slice | Sequence[int] | np.ndarray | None"
-
 _T = TypeVar("_T")
-
-
-class StoredArray(Protocol):
-    """An array on disk, which Zarr's own types say little about: parts of it are NumPy arrays."""
-
-    shape: tuple[int, ...]
-    chunks: tuple[int, ...]
-    shards: tuple[int, ...] | None
-    dtype: np.dtype
-    oindex: Any
-
-    def __getitem__(self, selection: Any, /) -> np.ndarray: ...
-
-    def __setitem__(self, selection: Any, value: np.ndarray, /) -> None: ...
 
 
 def create_store(
@@ -207,40 +190,7 @@ class BTFStore:
         dict
             JSON types: kind, shape, directions, type, bytes, coverage, attributes.
         """
-        rows, columns = self.texels
-        covered = self.coverage
-        files = [entry for entry in self.path.rglob("*") if entry.is_file()]
-        count = len(self.views) * len(self.lights) * rows * columns * 3
-        return {
-            "kind": KIND,
-            "method": "sampled",
-            "shape": [len(self.views), len(self.lights), rows, columns, 3],
-            "directions": {
-                "views": {"name": self.views.name, "count": len(self.views)},
-                "lights": {"name": self.lights.name, "count": len(self.lights)},
-            },
-            "dtype": str(self.dtype),
-            "payload_bytes": count * self.dtype.itemsize,
-            # As for representations: a ratio is against 32-bit floats.
-            "raw_bytes": 4 * count,
-            "file_bytes": sum(entry.stat().st_size for entry in files),
-            "ratio": 4 / self.dtype.itemsize,
-            "coverage": float(covered.mean()),
-            "coverage_of": {
-                "views": int(covered.any(axis=(1, 2, 3)).sum()),
-                "lights": int(covered.any(axis=(0, 2, 3)).sum()),
-                "pairs": f"{int(covered.any(axis=(2, 3)).sum())} of {covered[:, :, 0, 0].size}",
-                "tiles": f"{int(covered.any(axis=(0, 1)).sum())} of {covered[0, 0].size}",
-            },
-            "complete": bool(covered.all()),
-            "has_variance": self.has_variance,
-            "error": summary(self),
-            "parameters": self.attributes.get("parameters", {}),
-            "parent": self.attributes.get("parent", {}),
-            "seed": self.attributes.get("seed"),
-            "versions": self.attributes.get("versions", {}),
-            "attributes": self.attributes,
-        }
+        return store_facts(self)
 
     @property
     def shard(self) -> tuple[int, int]:
@@ -438,7 +388,7 @@ class BTFStore:
         axes = zip(
             ("views", "lights", "rows", "columns"), (views, lights, rows, columns), lengths, strict=True
         )
-        selection = [_selection(name, index, n) for name, index, n in axes]
+        selection = [along_axis(name, index, n) for name, index, n in axes]
         indices = [np.arange(n)[chosen] for chosen, n in zip(selection, lengths, strict=True)]
         tiles = [np.unique(index // size) for index, size in zip(indices[2:], self.tile, strict=True)]
         covered = self.coverage[np.ix_(indices[0], indices[1], *tiles)]
@@ -466,20 +416,3 @@ class BTFStore:
                 "negative variance", file=self.path, field=field, got=values.min(), expected="≥ 0"
             )
         return values
-
-
-def _selection(name: str, index: Choice, n: int) -> slice | np.ndarray:
-    """An index as a slice where it is one (Zarr reads slices much faster), else as an array of int."""
-    if index is None:
-        return slice(None)
-    chosen = (
-        np.atleast_1d(np.arange(n)[index]) if isinstance(index, slice) else np.atleast_1d(np.asarray(index))
-    )
-    if chosen.ndim != 1 or chosen.size == 0 or not np.issubdtype(chosen.dtype, np.integer):
-        raise InputError("selection", field=name, got=index, expected="indices")
-    if chosen.min() < -n or chosen.max() >= n:
-        raise InputError("index out of range", field=name, got=index, expected=f"0 … {n - 1}")
-    chosen = np.where(chosen < 0, chosen + n, chosen)
-    if (np.diff(chosen) == 1).all():
-        return slice(int(chosen[0]), int(chosen[-1]) + 1)
-    return chosen

@@ -14,7 +14,7 @@ from btfref.commands.shared import images, printing, reading
 from btfref.errors import BtfrefError, InputError, MissingDependencyError
 from btfref.gates import tolerance
 from btfref.numerics.sphere.directions import directions
-from btfref.provenance import __version__, versions
+from btfref.provenance import LLVM, __version__, versions
 from btfref.registry import method
 
 
@@ -237,6 +237,7 @@ def test_fit_parameters():
 
 def test_versions_name_what_is_not_installed():
     found = versions(["numpy", "no-such-distribution"])
+    assert {"scikit-learn", "PyMaxflow", LLVM} <= set(versions())
     assert found["numpy"] == np.__version__
     assert found["no-such-distribution"] is None
     assert found["btfref"] == __version__

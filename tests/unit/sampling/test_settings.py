@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 import btfref
+from btfref import platform
 from btfref.cli import build_parser
 from btfref.errors import InputError
 from btfref.numerics.sphere.directions import directions
+from btfref.provenance import LLVM, versions
 from btfref.sampling import SynthesisSettings, open_store
 from btfref.sampling.synthesis import synthesize, synthesize_store
 
@@ -133,3 +135,12 @@ def test_a_store_that_did_not_say_its_llvm_is_continued(tmp_path):
         synthesize_store(out, "flat", **SMALL)
     edit(lambda versions: versions.pop("LLVM"))
     assert synthesize_store(out, "flat", **SMALL).complete
+
+
+def test_versions_say_which_llvm_is_used(monkeypatch):
+    for name, said in (("libLLVM-18.so.1", "18"), ("somewhere.so", "somewhere.so")):
+        choice = platform.LLVMChoice(f"/opt/{name}", platform.llvm_version(f"/opt/{name}"), "", ())
+        monkeypatch.setattr(platform, "choose_llvm", lambda choice=choice: choice)
+        assert versions([LLVM])[LLVM] == said
+    monkeypatch.setattr(platform, "choose_llvm", lambda: platform.LLVMChoice(None, None, "", ()))
+    assert versions([LLVM])[LLVM] is None
