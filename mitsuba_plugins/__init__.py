@@ -6,10 +6,10 @@ After ``mi.set_variant(...)`` call :func:`register`; then scenes may use
 
 from __future__ import annotations
 
-_registered = set()
+_registered: set[str] = set()
 
 
-def register():
+def register() -> None:
     """Make the plugin type ``btf`` known to the current Mitsuba variant; repeated calls do nothing.
 
     Raises

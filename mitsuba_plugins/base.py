@@ -6,6 +6,7 @@ Nothing else in the project uses ``wi`` and ``wo``.
 from __future__ import annotations
 
 from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -23,6 +24,13 @@ from mitsuba_plugins.lib.proposals import Guided, Mixture
 from mitsuba_plugins.lib.tables import tensor
 from mitsuba_plugins.protocol import Displaced, LevelledEvaluator, Proposes
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from btfref.representations.protocol import Representation
+    from btfref.types import JitArray
+    from mitsuba_plugins.protocol import Proposal
+
 
 class Maps:
     """The maps of a representation on the device, and the shared tables of an evaluator.
@@ -38,7 +46,7 @@ class Maps:
     meta : dict
     """
 
-    def __init__(self, representation, filter_type):
+    def __init__(self, representation: Representation, filter_type: str) -> None:
         arrays = representation.port_arrays()
         self.meta = representation.meta
         self.shape = tuple(self.meta["texels"])
@@ -49,7 +57,7 @@ class Maps:
         }
 
 
-def make_bsdf():
+def make_bsdf() -> type:
     """The plugin class for the current Mitsuba variant."""
 
     class BTF(mi.BSDF):
@@ -81,7 +89,7 @@ def make_bsdf():
         ``twosided`` for both. Methods without levels of detail ignore the parameters that choose one.
         """
 
-        def __init__(self, props):
+        def __init__(self, props: JitArray) -> None:
             mi.BSDF.__init__(self, props)
             from btfref.representations import load
 
@@ -119,7 +127,7 @@ def make_bsdf():
             self.m_components = [flags]
             self.m_flags = flags
 
-        def _share_of_own_lobes(self, props):
+        def _share_of_own_lobes(self, props: JitArray) -> float:
             """Share of the method's own proposal in [0, 1], beside the guide; −1: neither."""
             shares, default = {"data": 0.0, "cosine": -1.0}, "data"
             if isinstance(self.evaluator, Proposes):
@@ -127,7 +135,7 @@ def make_bsdf():
                 default = self.evaluator.sampling
             return shares[_choice(props, "sampling", default, tuple(shares))]
 
-        def _level_of_detail(self, props):
+        def _level_of_detail(self, props: JitArray) -> LevelOfDetail | None:
             """What chooses λ, or None for a method without levels; parameters are checked either way."""
             mode = _choice(props, "lod", "auto", MODES)
             bias = _number(props, "lod_bias", 0.0)
@@ -138,15 +146,15 @@ def make_bsdf():
                 return None
             return LevelOfDetail(mode, bias, unit, angle, camera, self.affine, self.maps.shape)
 
-        def _uv(self, si):
+        def _uv(self, si: JitArray) -> JitArray:
             # Terms with factor 0 are left out: a coordinate that is not finite must not spoil the other one.
-            def row(a, b, c):
+            def row(a: float, b: float, c: float) -> JitArray:
                 value = mi.Float(c) if b == 0 else dr.fma(si.uv.y, b, c)
                 return value if a == 0 else dr.fma(si.uv.x, a, value)
 
             return mi.Point2f(*(row(*coefficients) for coefficients in self.affine))
 
-        def _local(self, w):
+        def _local(self, w: JitArray) -> tuple[JitArray, JitArray]:
             """A direction in the texture's frame, and whether it is valid; the pole stands in for invalid ones.
 
             Sanitized one by one, so that what depends on the view alone is recorded once for all methods that a
@@ -156,17 +164,17 @@ def make_bsdf():
             valid = valid_directions(w)
             return dr.select(valid, w, mi.Vector3f(0, 0, 1)), valid
 
-        def _turn(self, w, sign=1):
+        def _turn(self, w: JitArray, sign: int = 1) -> JitArray:
             c, s = self.rotation
             if s == 0 and c > 0:
                 return mi.Vector3f(w)
             return mi.Vector3f(c * w.x - sign * s * w.y, sign * s * w.x + c * w.y, w.z)
 
         @staticmethod
-        def _enabled(ctx):
+        def _enabled(ctx: JitArray) -> bool:
             return ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
 
-        def _view(self, si, w_view, active):
+        def _view(self, si: JitArray, w_view: JitArray, active: JitArray) -> tuple[dict[str, Any], Proposal]:
             """What is known of the view alone: arguments of the evaluator, and what proposes light directions.
 
             An evaluator with geometry finds the point that the view sees, and the guide looks its tables up there;
@@ -185,7 +193,15 @@ def make_bsdf():
             guided = Guided(self.guide, self.guide.neighbours(place, w_view, known.get("lod")))
             return known, guided if self.own_share <= 0 else Mixture(own, guided, self.own_share)
 
-        def _value(self, ctx, si, w_light, w_view, active, known=None):
+        def _value(
+            self,
+            ctx: JitArray,
+            si: JitArray,
+            w_light: JitArray,
+            w_view: JitArray,
+            active: JitArray,
+            known: dict[str, Any] | None = None,
+        ) -> JitArray:
             if ctx.mode == mi.TransportMode.Importance:
                 # The view's hit is of no use where the roles are swapped.
                 w_view, w_light, known = w_light, w_view, None
@@ -194,25 +210,29 @@ def make_bsdf():
             value = self.evaluator.evaluate(self._uv(si), w_light, w_view, active, **known)
             return dr.select(active, value * self.scale, 0)
 
-        def _directions(self, si, wo, active):
+        def _directions(
+            self, si: JitArray, wo: JitArray, active: JitArray
+        ) -> tuple[JitArray, JitArray, JitArray]:
             w_view, view_valid = self._local(si.wi)
             w_light, light_valid = self._local(wo)
             return w_view, w_light, mi.Bool(active) & view_valid & light_valid
 
-        def eval(self, ctx, si, wo, active=True):
+        def eval(self, ctx: JitArray, si: JitArray, wo: JitArray, active: JitArray = True) -> JitArray:
             if not self._enabled(ctx):
                 return mi.Color3f(0)
             w_view, w_light, active = self._directions(si, wo, active)
             return self._value(ctx, si, w_light, w_view, active)
 
-        def pdf(self, ctx, si, wo, active=True):
+        def pdf(self, ctx: JitArray, si: JitArray, wo: JitArray, active: JitArray = True) -> JitArray:
             if not self._enabled(ctx):
                 return mi.Float(0)
             # The sampled direction always plays the light: a guide for importance transport is not worth its memory.
             w_view, w_light, active = self._directions(si, wo, active)
             return self._view(si, w_view, active)[1].pdf(w_light, active)
 
-        def eval_pdf(self, ctx, si, wo, active=True):
+        def eval_pdf(
+            self, ctx: JitArray, si: JitArray, wo: JitArray, active: JitArray = True
+        ) -> tuple[JitArray, JitArray]:
             if not self._enabled(ctx):
                 return mi.Color3f(0), mi.Float(0)
             w_view, w_light, active = self._directions(si, wo, active)
@@ -220,7 +240,9 @@ def make_bsdf():
             value = self._value(ctx, si, w_light, w_view, active, known)
             return value, proposal.pdf(w_light, active)
 
-        def sample(self, ctx, si, sample1, sample2, active=True):
+        def sample(
+            self, ctx: JitArray, si: JitArray, sample1: JitArray, sample2: JitArray, active: JitArray = True
+        ) -> tuple[JitArray, JitArray]:
             bs = dr.zeros(mi.BSDFSample3f)
             if not self._enabled(ctx):
                 return bs, mi.Color3f(0)
@@ -238,7 +260,7 @@ def make_bsdf():
             usable = active & (bs.pdf > 0)
             return bs, dr.select(usable, value / bs.pdf, 0)
 
-        def traverse(self, callback):
+        def traverse(self, callback: JitArray) -> None:
             callback.put("scale", self.scale, mi.ParamFlags.Differentiable)
             for name, values in self.maps.tensors.items():
                 integer = dr.is_integral_v(values.array)
@@ -247,12 +269,12 @@ def make_bsdf():
             if self.detail is not None:
                 self.detail.traverse(callback)
 
-        def parameters_changed(self, keys):
+        def parameters_changed(self, keys: list[str]) -> None:
             # A moved camera changes no map. Without keys anything may have changed.
             if not keys or any(key in self.maps.tensors for key in keys):
                 self.evaluator.update(self.maps)
 
-        def to_string(self):
+        def to_string(self) -> str:
             return (
                 f"BTF[filename={self.filename}, method={self.key}, filter_type={self.filter_type}, "
                 f"texels={self.maps.shape}, displaced={isinstance(self.evaluator, Displaced)}]"
@@ -261,11 +283,11 @@ def make_bsdf():
     return BTF
 
 
-def _parameter(props, name, default):
+def _parameter(props: JitArray, name: str, default: object) -> Any:
     return props[name] if name in props else default
 
 
-def _choice(props, name, default, choices):
+def _choice(props: JitArray, name: str, default: str, choices: Sequence[str]) -> str:
     value = _parameter(props, name, default)
     if value not in choices:
         raise InputError(
@@ -274,7 +296,7 @@ def _choice(props, name, default, choices):
     return value
 
 
-def _indices(props, name):
+def _indices(props: JitArray, name: str) -> list[int] | None:
     """Whole numbers of a parameter, separated by spaces or commas; None where there is none."""
     text = _parameter(props, name, None)
     if text is None:
@@ -285,7 +307,9 @@ def _indices(props, name):
         raise InputError("not a list of indices", field=name, got=repr(text)) from None
 
 
-def _number(props, name, default, *, least=-np.inf, positive=False):
+def _number(
+    props: JitArray, name: str, default: float, *, least: float = -np.inf, positive: bool = False
+) -> float:
     value = float(_parameter(props, name, default))
     if not (np.isfinite(value) and value >= least and (value > 0 or not positive)):
         bound = " > 0" if positive else "" if least == -np.inf else f" ≥ {least:g}"
@@ -295,5 +319,5 @@ def _number(props, name, default, *, least=-np.inf, positive=False):
     return value
 
 
-def _matrix(transform):
+def _matrix(transform: JitArray) -> np.ndarray:
     return np.eye(4) if transform is None else np.asarray(transform.matrix, float)

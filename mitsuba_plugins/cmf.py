@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 
@@ -10,17 +12,21 @@ from mitsuba_plugins.lib.lookup import texel_stencil
 from mitsuba_plugins.lib.parabolic import ParabolicMaps, bilinear_stencil, half_difference, unpacked
 from mitsuba_plugins.lib.tables import as_float32, read_packets
 
+if TYPE_CHECKING:
+    from btfref.types import JitArray
+    from mitsuba_plugins.base import Maps
+
 
 class Evaluator:
     """Multiplies the maps that each texel's index names, and blends texels."""
 
-    def __init__(self, maps):
+    def __init__(self, maps: Maps) -> None:
         self.shape, self.filter_type = maps.shape, maps.filter_type
         self.constants = maps.meta["constants"]
         self.slots = index_slots(self.constants)
         self.update(maps)
 
-    def update(self, maps):
+    def update(self, maps: Maps) -> None:
         """Take over changed maps."""
         tensors = maps.tensors
         self.factors = {
@@ -34,12 +40,12 @@ class Evaluator:
         self.peak = tensors["scale_peak"].array
 
     @staticmethod
-    def _readable(tensor):
+    def _readable(tensor: JitArray) -> JitArray:
         """Values of a map of scales: floats, or words of four codes."""
         return mi.UInt32(tensor.array) if dr.is_integral_v(tensor.array) else as_float32(tensor)
 
     @staticmethod
-    def _colour(values, at, power, active):
+    def _colour(values: JitArray, at: JitArray, power: int, active: JitArray) -> JitArray:
         """Colour ``at`` of a map of scales."""
         if dr.is_integral_v(values):
             colour, factor = unpacked(dr.gather(mi.UInt32, values, at, active))
@@ -48,10 +54,12 @@ class Evaluator:
             colour = mi.Color3f(*(mi.Float(c) for c in read_packets(values, at, 4, active)[:3]))
         return raised(colour, power)
 
-    def _value(self, texel, stencils, active):
+    def _value(
+        self, texel: JitArray, stencils: dict[str, tuple[list[JitArray], list[JitArray]]], active: JitArray
+    ) -> JitArray:
         """B of one texel but for the fall to the horizon."""
 
-        def read(name, term):
+        def read(name: str, term: int) -> JitArray:
             slot = texel * self.index_stride + self.slots[name].start + term
             prototype = dr.gather(mi.UInt32, self.index, slot, active)
             return self.factors[name].lookup(prototype, stencils[name], active)
@@ -76,7 +84,7 @@ class Evaluator:
             half += term
         return in_out * half
 
-    def evaluate(self, uv, w_light, w_view, active):
+    def evaluate(self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray) -> JitArray:
         """B in 1/sr for valid directions; never negative."""
         h, d = half_difference(w_light, w_view)
         stencils = {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 
@@ -12,6 +14,11 @@ from mitsuba_plugins.lib.microfacets import HalfVectors, Microfacets
 from mitsuba_plugins.lib.parabolic import ParabolicMaps, bilinear_stencil, half_sum
 from mitsuba_plugins.lib.tables import as_float32
 
+if TYPE_CHECKING:
+    from btfref.types import JitArray
+    from mitsuba_plugins.base import Maps
+    from mitsuba_plugins.lib.heightfield import Hit
+
 
 class Evaluator:
     """Marches to the surface, to the light, and evaluates the microfacet materials around the hit."""
@@ -19,12 +26,12 @@ class Evaluator:
     #: What samples light directions unless told otherwise; measured by ``btfref bench proposals``.
     sampling = "both"
 
-    def __init__(self, maps):
+    def __init__(self, maps: Maps) -> None:
         self.shape, self.filter_type = maps.shape, maps.filter_type
         self.constants = maps.meta["constants"]
         self.update(maps)
 
-    def update(self, maps):
+    def update(self, maps: Maps) -> None:
         """Take over changed maps."""
         tensors = maps.tensors
         self.field = HeightField(tensors["cells"].array, self.shape, self.constants)
@@ -32,13 +39,15 @@ class Evaluator:
         self.colour, self.ndf = as_float32(tensors["colour"]), ParabolicMaps(tensors["ndf"], 1)
         self.half_vectors = HalfVectors(tensors["ndf"].numpy())
 
-    def hit(self, uv, w_view, active):
+    def hit(self, uv: JitArray, w_view: JitArray, active: JitArray) -> tuple[Hit, JitArray]:
         """The point that a view ray hits, for :meth:`evaluate`, and its texture coordinates, for sampling."""
         hit = self.field.view_hit(uv, w_view, active)
         cell, local, _ = hit
         return hit, (cell + local + 0.5) / mi.Vector2f(self.shape[1], self.shape[0])
 
-    def evaluate(self, uv, w_light, w_view, active, hit=None):
+    def evaluate(
+        self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray, hit: Hit | None = None
+    ) -> JitArray:
         """B in 1/sr for valid directions; never negative. A ``hit`` that is known need not be found again."""
         cell, local, height = hit or self.field.view_hit(uv, w_view, active)
         texels = self._texels(cell, local)
@@ -68,7 +77,9 @@ class Evaluator:
         value = dr.fma(diffuse, light * dr.inv_pi, gloss * factor)
         return dr.select(active, value, 0)
 
-    def proposal(self, uv, w_view, active, hit=None):
+    def proposal(
+        self, uv: JitArray, w_view: JitArray, active: JitArray, hit: Hit | None = None
+    ) -> Microfacets:
         """Half vectors of the nearest texel's material, and its diffuse part, in the frame of the hit."""
         cell, local, _ = hit or self.field.view_hit(uv, w_view, active)
         texels = self._texels(cell, local)
@@ -88,7 +99,7 @@ class Evaluator:
         share = gloss / dr.maximum(gloss + diffuse, 1e-20)
         return Microfacets(self.half_vectors, material, dr.detach(frame), w_view, share)
 
-    def _texels(self, cell, local):
+    def _texels(self, cell: JitArray, local: JitArray) -> list[tuple[JitArray, JitArray]]:
         """Texels that a point blends and their weights, as `btfref.representations.gbrdf.definition.texel_weights`."""
         rows, columns = self.shape
         c0, r0 = mi.UInt32(cell.x), mi.UInt32(cell.y)
@@ -104,7 +115,9 @@ class Evaluator:
             (r1 * columns + c1, a * b),
         ]
 
-    def _frame(self, texels, active):
+    def _frame(
+        self, texels: list[tuple[JitArray, JitArray]], active: JitArray
+    ) -> tuple[JitArray, JitArray, JitArray]:
         """Tangent, bitangent and normal, as `btfref.numerics.sphere.frames.surface_frame`."""
         total = mi.Vector4f(0)
         for texel, weight in texels:
@@ -120,6 +133,6 @@ class Evaluator:
         return c * u + s * v, c * v - s * u, normal
 
 
-def _unit(v):
+def _unit(v: JitArray) -> JitArray:
     """``v`` over its length by a square root and a division; ``dr.normalize`` takes an approximate reciprocal root."""
     return v / dr.sqrt(dr.squared_norm(v))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 
@@ -10,6 +12,11 @@ from mitsuba_plugins.lib.analytic import held, packet, safe_power
 from mitsuba_plugins.lib.lookup import texel_stencil
 from mitsuba_plugins.lib.proposals import CosineLobes
 
+if TYPE_CHECKING:
+    from btfref.types import JitArray
+    from mitsuba_plugins.base import Maps
+    from mitsuba_plugins.lib.lookup import Neighbour
+
 
 class Evaluator:
     """Evaluates the lobes of the neighbouring texels."""
@@ -17,7 +24,7 @@ class Evaluator:
     #: What samples light directions unless told otherwise; measured by ``btfref bench proposals``.
     sampling = "data"
 
-    def __init__(self, maps):
+    def __init__(self, maps: Maps) -> None:
         self.views = maps.views
         self.shape, self.filter_type = maps.shape, maps.filter_type
         constants = maps.meta["constants"]
@@ -25,18 +32,19 @@ class Evaluator:
         self.n_lobes = constants["n_lobes"]
         self.update(maps)
 
-    def update(self, maps):
+    def update(self, maps: Maps) -> None:
         """Take over changed maps."""
         self.width = maps.tensors["peaks"].shape[-1]
-        for name in ("lobes", "peaks", "colour"):
-            setattr(self, name, mi.Float(maps.tensors[name].array))
+        self.lobes, self.peaks, self.colour = (
+            mi.Float(maps.tensors[name].array) for name in ("lobes", "peaks", "colour")
+        )
         dr.eval(self.lobes, self.peaks, self.colour)
 
-    def factor(self, texel, views, active):
+    def factor(self, texel: JitArray, views: list[Neighbour], active: JitArray) -> JitArray:
         """View-dependent factor of a texel: 1."""
         return mi.Float(1)
 
-    def evaluate(self, uv, w_light, w_view, active):
+    def evaluate(self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray) -> JitArray:
         """B in 1/sr for valid directions; never negative."""
         light, fade = held(w_light, self.light_edge)
         v, _ = held(w_view, self.view_edge)
@@ -54,7 +62,7 @@ class Evaluator:
             total += value * mi.Color3f(red, green, blue)
         return total * (fade * light.z)
 
-    def proposal(self, uv, w_view, active):
+    def proposal(self, uv: JitArray, w_view: JitArray, active: JitArray) -> CosineLobes:
         """The lobes of the nearest texel for the view, and its diffuse part; a common factor does not matter."""
         v, _ = held(w_view, self.view_edge)
         (texel,), _ = texel_stencil(uv, self.shape, "nearest")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -13,6 +15,13 @@ from mitsuba_plugins.lib.footprint import probes
 from mitsuba_plugins.lib.lookup import Neighbour, texel_stencil
 from mitsuba_plugins.lib.tables import PairTable, as_float32, read_packets
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from btfref.types import JitArray
+    from mitsuba_plugins.base import Maps
+
+
 #: Sums are split at multiples of this: their upper parts add up without rounding. The channels and levels of a dark
 #: value cancel, and the rounding of a plain sum would then show; see shaders/lib/numbers/split_sum.glsl.
 QUANTUM = 2.0**-14
@@ -23,16 +32,16 @@ class SplitSum:
 
     DRJIT_STRUCT = {"high": mi.Color3f, "rest": mi.Color3f}  # noqa: RUF012 - read by Dr.Jit
 
-    def __init__(self, high=None, rest=None):
+    def __init__(self, high: JitArray = None, rest: JitArray = None) -> None:
         self.high = mi.Color3f(0) if high is None else high
         self.rest = mi.Color3f(0) if rest is None else rest
 
-    def plus(self, term):
+    def plus(self, term: JitArray) -> SplitSum:
         """The sum with a further colour."""
         high = dr.floor(dr.fma(term, 1 / QUANTUM, 0.5)) * QUANTUM
         return SplitSum(self.high + high, self.rest + (term - high))
 
-    def value(self):
+    def value(self) -> JitArray:
         """The colour."""
         return self.high + self.rest
 
@@ -40,14 +49,16 @@ class SplitSum:
 class Bands(PairTable):
     """Table whose entries hold components of Y, Cb and Cr in turn, each with its own coefficient."""
 
-    def __init__(self, values, following, counts):
+    def __init__(self, values: JitArray, following: np.ndarray | None, counts: Sequence[int]) -> None:
         self.ends = np.cumsum([0, *counts]).tolist()
         super().__init__(values, following)
 
-    def _needed(self, coefficients):
+    def _needed(self, coefficients: list[JitArray]) -> int:
         return self.ends[-1]
 
-    def _blend(self, total, values, coefficients, weight):
+    def _blend(
+        self, total: SplitSum, values: list[JitArray], coefficients: list[JitArray], weight: JitArray
+    ) -> SplitSum:
         colour = []
         for start, end in zip(self.ends, self.ends[1:], strict=False):
             part = mi.Float(0)
@@ -60,7 +71,7 @@ class Bands(PairTable):
 class Evaluator:
     """Sums the levels from ⌊λ⌋ on; finer ones are neither looked up nor computed."""
 
-    def __init__(self, maps):
+    def __init__(self, maps: Maps) -> None:
         constants = maps.meta["constants"]
         self.views, self.lights, self.filter_type = maps.views, maps.lights, maps.filter_type
         self.nearest = bool(constants["nearest_directions"])
@@ -80,7 +91,7 @@ class Evaluator:
         dr.eval(self.sizes)
         self.update(maps)
 
-    def update(self, maps):
+    def update(self, maps: Maps) -> None:
         """Take over changed maps."""
         tensors = maps.tensors
         self.differentiable = any(dr.grad_enabled(tensors[name]) for name in ("basis", "weights"))
@@ -93,7 +104,16 @@ class Evaluator:
         else:
             self.phong = as_float32(tensors["phong"])
 
-    def evaluate(self, uv, w_light, w_view, active, lod=0.0, step=None, ratio=None):
+    def evaluate(
+        self,
+        uv: JitArray,
+        w_light: JitArray,
+        w_view: JitArray,
+        active: JitArray,
+        lod: JitArray = 0.0,
+        step: JitArray = None,
+        ratio: JitArray = None,
+    ) -> JitArray:
         """B in 1/sr for valid directions, or its mean along a footprint; may be slightly negative.
 
         See :class:`mitsuba_plugins.lib.footprint.LevelOfDetail` for ``lod``, ``step`` and ``ratio``.
@@ -118,7 +138,7 @@ class Evaluator:
                 )
             return _rgb(total.value()) * finest
 
-        def body(level, total):
+        def body(level: JitArray, total: SplitSum) -> tuple[JitArray, SplitSum]:
             here = active & (level < self.n_levels)
             return level + 1, self._with_level(total, level, along, views, lights, lod, here)
 
@@ -130,13 +150,24 @@ class Evaluator:
         )
         return _rgb(total.value()) * finest
 
-    def _with_level(self, total, level, along, views, lights, lod, active):
+    def _with_level(
+        self,
+        total: SplitSum,
+        level: JitArray,
+        along: tuple[JitArray, JitArray, JitArray],
+        views: list[Neighbour],
+        lights: list[Neighbour],
+        lod: JitArray,
+        active: JitArray,
+    ) -> SplitSum:
         """The sum in Y, Cb, Cr with a level."""
         share = dr.clip(1 - lod + mi.Float(level), 0, 1)
         rows, columns, first, _ = dr.gather(mi.Array4u, self.sizes, level, active)
         shape = dr.maximum(rows, 1), dr.maximum(columns, 1)
 
-        def lookup(coefficient, uv, share, active):
+        def lookup(
+            coefficient: list[JitArray], uv: JitArray, share: JitArray, active: JitArray
+        ) -> list[JitArray]:
             coefficient = list(coefficient)
             for texel, weight in zip(*texel_stencil(uv, shape, self.filter_type), strict=True):
                 weight = weight * share
@@ -157,7 +188,7 @@ class Evaluator:
         else:
             reach, weight = probes(ratio)
 
-            def body(j, coefficient):
+            def body(j: JitArray, coefficient: list[JitArray]) -> tuple[JitArray, list[JitArray]]:
                 here = active & (j <= reach)
                 return j + 1, lookup(coefficient, uv + mi.Float(j) * step, share * weight(j), here)
 
@@ -166,7 +197,14 @@ class Evaluator:
             )
         return self.basis.combine(level - self.base, views, lights, coefficient, active, total)
 
-    def _mean(self, w_light, w_view, views, lights, active):
+    def _mean(
+        self,
+        w_light: JitArray,
+        w_view: JitArray,
+        views: list[Neighbour],
+        lights: list[Neighbour],
+        active: JitArray,
+    ) -> SplitSum:
         """The mean of the coarsest level in Y, Cb, Cr."""
         if self.mean is not None:
             return self.mean.combine(mi.UInt32(0), views, lights, [mi.Float(1)] * 3, active, SplitSum())
@@ -179,7 +217,7 @@ class Evaluator:
         return SplitSum().plus(mi.Color3f(luminance, p[4], p[5]) * fade)
 
 
-def _heaviest(neighbours):
+def _heaviest(neighbours: list[Neighbour]) -> list[Neighbour]:
     """The sample with the largest weight, with the weight of all."""
     (index, best), *rest = (pair for neighbour in neighbours for pair in neighbour.single())
     total = best
@@ -191,6 +229,6 @@ def _heaviest(neighbours):
     return [Neighbour(index, total, index, mi.Float(0))]
 
 
-def _rgb(ycc):
+def _rgb(ycc: JitArray) -> JitArray:
     rows = TO_RGB.tolist()
     return mi.Color3f(*(dr.fma(r[1], ycc[1], dr.fma(r[2], ycc[2], r[0] * ycc[0])) for r in rows))

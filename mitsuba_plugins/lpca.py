@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 
 from mitsuba_plugins.lib.lookup import texel_stencil
 from mitsuba_plugins.lib.tables import PairTable, as_float32, read_packets
 
+if TYPE_CHECKING:
+    from btfref.types import JitArray
+    from mitsuba_plugins.base import Maps
+    from mitsuba_plugins.lib.lookup import Neighbour
+
 
 class Evaluator:
     """Combines the interpolated mean and eigen-BRDFs of each texel's cluster."""
 
-    def __init__(self, maps):
+    def __init__(self, maps: Maps) -> None:
         self.views, self.lights = maps.views, maps.lights
         self.shape, self.filter_type = maps.shape, maps.filter_type
         self.n_components = maps.meta["constants"]["n_components"]
         self.update(maps)
 
-    def update(self, maps):
+    def update(self, maps: Maps) -> None:
         """Take over changed maps."""
         weights = maps.tensors["weights"]
         self.differentiable = dr.grad_enabled(weights) or dr.grad_enabled(maps.tensors["basis"])
@@ -28,7 +35,7 @@ class Evaluator:
         self.cluster = mi.UInt32(maps.tensors["cluster"].array)
         self.cluster_stride = maps.tensors["cluster"].shape[-1]
 
-    def _texel(self, texel, share, active):
+    def _texel(self, texel: JitArray, share: JitArray, active: JitArray) -> tuple[JitArray, list[JitArray]]:
         """Cluster of a texel and the coefficients of its mean and components, times ``share``."""
         # Not fetched without weight: a texel whose cluster is not kept holds no numbers.
         active = active & (share > 0)
@@ -36,7 +43,7 @@ class Evaluator:
         weights = read_packets(self.weights, texel, self.width, active)[: self.n_components]
         return cluster, [mi.Float(share), *(mi.Float(w) * share for w in weights)]
 
-    def evaluate(self, uv, w_light, w_view, active):
+    def evaluate(self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray) -> JitArray:
         """B in 1/sr for valid directions; may be slightly negative."""
         views, lights = self.views.stencil(w_view), self.lights.stencil(w_light, hold=False)
         texels = [
@@ -52,7 +59,13 @@ class Evaluator:
             return sum(parts[1:], parts[0])
         return self._combine_distinct(texels, views, lights, active)
 
-    def _combine_distinct(self, texels, views, lights, active):
+    def _combine_distinct(
+        self,
+        texels: list[tuple[JitArray, list[JitArray]]],
+        views: list[Neighbour],
+        lights: list[Neighbour],
+        active: JitArray,
+    ) -> JitArray:
         """Sum over texels, with one table lookup per distinct cluster: neighbours mostly share theirs."""
         clusters = [cluster for cluster, _ in texels]
         # Each texel's coefficients join those of the first texel of the same cluster.
@@ -75,7 +88,7 @@ class Evaluator:
             rank.append(rank[-1] + dr.select(owners[i - 1] == i - 1, mi.UInt32(1), 0))
         n_distinct = rank[-1] + dr.select(owners[-1] == len(texels) - 1, mi.UInt32(1), 0)
 
-        def body(step, total, *_):
+        def body(step: JitArray, total: JitArray, *_: JitArray) -> tuple[JitArray, JitArray]:
             cluster, coefficient = clusters[0], merged[0]
             for i in range(1, len(texels)):
                 here = (rank[i] == step) & (owners[i] == i)

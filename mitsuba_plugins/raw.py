@@ -2,28 +2,34 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import mitsuba as mi
 
 from mitsuba_plugins.lib.lookup import texel_stencil
 from mitsuba_plugins.lib.tables import PairTable
 
+if TYPE_CHECKING:
+    from btfref.types import JitArray
+    from mitsuba_plugins.base import Maps
+
 
 class Evaluator:
     """Interpolates the table of a ``raw`` BTF."""
 
-    def __init__(self, maps):
+    def __init__(self, maps: Maps) -> None:
         self.views, self.lights = maps.views, maps.lights
         self.shape, self.filter_type = maps.shape, maps.filter_type
         self.update(maps)
 
-    def update(self, maps):
+    def update(self, maps: Maps) -> None:
         """Take over changed maps."""
         values = maps.tensors["values"]
         rows, columns, n_views, n_lights, width = values.shape
         table = type(values)(values.array, (rows * columns, n_views, n_lights, width))
         self.values = PairTable(table, self.lights.following())
 
-    def evaluate(self, uv, w_light, w_view, active):
+    def evaluate(self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray) -> JitArray:
         """B in 1/sr for valid directions."""
         views, lights = self.views.stencil(w_view), self.lights.stencil(w_light, hold=False)
         total = mi.Color3f(0)

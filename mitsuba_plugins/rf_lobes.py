@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 
 from mitsuba_plugins.lib.analytic import held, packet, parabolic_axis, single, unit_lobe
 from mitsuba_plugins.lib.lookup import texel_stencil
 from mitsuba_plugins.lib.proposals import CosineLobes
+
+if TYPE_CHECKING:
+    from btfref.types import JitArray
+    from mitsuba_plugins.base import Maps
 
 
 class Evaluator:
@@ -16,20 +22,20 @@ class Evaluator:
     #: What samples light directions unless told otherwise; measured by ``btfref bench proposals``.
     sampling = "both"
 
-    def __init__(self, maps):
+    def __init__(self, maps: Maps) -> None:
         self.views, self.n_views = maps.views, maps.tensors["lobes"].shape[2]
         self.shape, self.filter_type = maps.shape, maps.filter_type
         constants = maps.meta["constants"]
         self.edge, self.n_lobes = constants["light_edge"], constants["n_lobes"]
         self.update(maps)
 
-    def update(self, maps):
+    def update(self, maps: Maps) -> None:
         """Take over changed maps."""
         self.lobes = mi.Float(maps.tensors["lobes"].array)
         self.colour = mi.Float(maps.tensors["colour"].array)
         dr.eval(self.lobes, self.colour)
 
-    def evaluate(self, uv, w_light, w_view, active):
+    def evaluate(self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray) -> JitArray:
         """B in 1/sr for valid directions; never negative."""
         light, fade = held(w_light, self.edge)
         views = single(self.views.stencil(w_view))
@@ -45,7 +51,7 @@ class Evaluator:
             total += (value * share) * mi.Color3f(red, green, blue)
         return total * fade
 
-    def proposal(self, uv, w_view, active):
+    def proposal(self, uv: JitArray, w_view: JitArray, active: JitArray) -> CosineLobes:
         """The lobes of the neighbouring views and the diffuse part, of the nearest texel: all four texels halve the
         variance once more on glossy rings, and cost what that gains elsewhere.
         """  # noqa: D205

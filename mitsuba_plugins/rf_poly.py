@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 
 from mitsuba_plugins.lib.analytic import held, packet, single
 from mitsuba_plugins.lib.lookup import texel_stencil
 
+if TYPE_CHECKING:
+    from btfref.types import JitArray
+    from mitsuba_plugins.base import Maps
+
 
 class Evaluator:
     """Evaluates the polynomials of the neighbouring texels and views."""
 
-    def __init__(self, maps):
+    def __init__(self, maps: Maps) -> None:
         self.views, self.n_views = maps.views, maps.tensors["polynomial"].shape[2]
         self.shape, self.filter_type = maps.shape, maps.filter_type
         self.edge = maps.meta["constants"]["light_edge"]
         self.update(maps)
 
-    def update(self, maps):
+    def update(self, maps: Maps) -> None:
         """Take over changed maps."""
         self.polynomial = mi.Float(maps.tensors["polynomial"].array)
         self.chroma = mi.Float(maps.tensors["chroma"].array)
         dr.eval(self.polynomial, self.chroma)
 
-    def evaluate(self, uv, w_light, w_view, active):
+    def evaluate(self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray) -> JitArray:
         """B in 1/sr for valid directions; may be negative."""
         light, fade = held(w_light, self.edge)
         terms = [light.x * light.x, light.y * light.y, light.x * light.y, light.x, light.y, light.z * light.z]

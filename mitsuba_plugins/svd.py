@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 
 from mitsuba_plugins.lib.lookup import texel_stencil
 from mitsuba_plugins.lib.tables import PairTable, as_float32, read_packets
 
+if TYPE_CHECKING:
+    from btfref.types import JitArray
+    from mitsuba_plugins.base import Maps
+
 
 class Evaluator:
     """Combines the interpolated basis with the texels' weights."""
 
-    def __init__(self, maps):
+    def __init__(self, maps: Maps) -> None:
         self.views, self.lights = maps.views, maps.lights
         self.shape, self.filter_type = maps.shape, maps.filter_type
         self.n_components = maps.meta["constants"]["n_components"]
         self.update(maps)
 
-    def update(self, maps):
+    def update(self, maps: Maps) -> None:
         """Take over changed maps."""
         basis, weights = maps.tensors["basis"], maps.tensors["weights"]
         self.basis = PairTable(type(basis)(basis.array, (1, *basis.shape)), self.lights.following())
         self.weights, self.width = as_float32(weights), weights.shape[-1]
 
-    def evaluate(self, uv, w_light, w_view, active):
+    def evaluate(self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray) -> JitArray:
         """B in 1/sr for valid directions; may be slightly negative."""
         coefficient = [mi.Float(0)] * self.width
         for texel, share in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True):

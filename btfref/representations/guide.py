@@ -14,12 +14,12 @@ N_GROUPS = 64
 N_FEATURE_VIEWS = 7
 
 
-def feature_views(n_views):
+def feature_views(n_views: int) -> np.ndarray:
     """Indices of a few views, spread over the set."""
     return np.unique(np.linspace(0, n_views - 1, min(N_FEATURE_VIEWS, n_views)).round().astype(int))
 
 
-def texel_groups(tables, n_groups=N_GROUPS):
+def texel_groups(tables: np.ndarray, n_groups: int = N_GROUPS) -> np.ndarray:
     """Partition texels by the shape of their reflectance, whatever its amount.
 
     Parameters
@@ -41,7 +41,7 @@ def texel_groups(tables, n_groups=N_GROUPS):
     return labels.astype(np.uint32)
 
 
-def group_means(labels, rows):
+def group_means(labels: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Mean of the rows of each group; groups without members get zeros.
 
     Parameters

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,6 +11,18 @@ from btfref import conventions
 from btfref.errors import InputError
 from btfref.numerics.sphere import interpolation
 from btfref.precision import real
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from typing import Self
+
+    from numpy.typing import ArrayLike
+
+    from btfref.numerics.sphere.directions import DirectionSet
+    from btfref.representations.protocol import Representation
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.types import Facts
+
 
 #: Points evaluated at a time: bounds the memory of the gathered neighbourhoods.
 CHUNK = 1 << 14
@@ -27,7 +40,7 @@ class Stencils:
     light_weight: np.ndarray
 
     @property
-    def pair_weight(self):
+    def pair_weight(self) -> np.ndarray:
         """Weights of the (view, light) pairs, shape (N, V, L)."""
         return self.view_weight[:, :, None] * self.light_weight[:, None, :]
 
@@ -39,8 +52,8 @@ class StoredMaps:
     A convenience: :class:`btfref.representations.protocol.Representation` asks for the methods, not for this class.
     """
 
-    maps: dict
-    meta: dict
+    maps: dict[str, np.ndarray]
+    meta: Facts
 
     def __repr__(self) -> str:
         from btfref.representations.file.container import payload_bytes
@@ -50,21 +63,27 @@ class StoredMaps:
         kind = f"Representation {meta['method']}"
         return conventions.in_one_line(kind, meta["texels"], meta["views"], meta["lights"], size)
 
-    def arrays(self):
+    def arrays(self) -> dict[str, np.ndarray]:
         """All maps and the direction tables, as they are stored."""
         return self.maps
 
-    def port_arrays(self):
+    def port_arrays(self) -> dict[str, np.ndarray]:
         """The same with channels padded to four."""
         return packed_arrays(self.maps)
 
     @classmethod
-    def from_arrays(cls, arrays, meta):
+    def from_arrays(cls, arrays: dict[str, np.ndarray], meta: Facts) -> Self:
         """The representation whose :meth:`arrays` and ``meta`` these are."""
         return cls(arrays, meta)
 
 
-def evaluate_tabulated(representation, kernel, uv, w_light, w_view):
+def evaluate_tabulated(
+    representation: Representation,
+    kernel: Callable[[Stencils], np.ndarray],
+    uv: ArrayLike,
+    w_light: ArrayLike,
+    w_view: ArrayLike,
+) -> np.ndarray:
     """Evaluate a method that interpolates tables over measured directions and texels.
 
     Parameters
@@ -82,7 +101,7 @@ def evaluate_tabulated(representation, kernel, uv, w_light, w_view):
     arrays, meta = representation.arrays(), representation.meta
     views, lights = interpolation.from_arrays(arrays, "view"), interpolation.from_arrays(arrays, "light")
 
-    def lookup(uv, w_light, w_view):
+    def lookup(uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray) -> np.ndarray:
         texel, texel_weight = conventions.texel_stencil(uv, meta["texels"], meta["filter_type"])
         view, view_weight = views.stencil(w_view)
         light, light_weight = lights.stencil(w_light, hold=False)
@@ -91,7 +110,13 @@ def evaluate_tabulated(representation, kernel, uv, w_light, w_view):
     return evaluate_points(lookup, uv, w_light, w_view)
 
 
-def evaluate_points(lookup, uv, w_light, w_view, *scalars):
+def evaluate_points(
+    lookup: Callable[..., np.ndarray],
+    uv: ArrayLike,
+    w_light: ArrayLike,
+    w_view: ArrayLike,
+    *scalars: ArrayLike,
+) -> np.ndarray:
     """Evaluate point by point: broadcast, leave out what is not valid, bound the memory.
 
     Parameters
@@ -106,33 +131,28 @@ def evaluate_points(lookup, uv, w_light, w_view, *scalars):
     -------
     ndarray of float64, shape (..., 3)
     """
-    uv, w_light, w_view = (real(a) for a in (uv, w_light, w_view))
-    scalars = [real(a) for a in scalars]
-    shape = np.broadcast_shapes(
-        uv.shape[:-1], w_light.shape[:-1], w_view.shape[:-1], *(a.shape for a in scalars)
-    )
-    uv, w_light, w_view = (
-        np.broadcast_to(a, (*shape, a.shape[-1])).reshape(-1, a.shape[-1]) for a in (uv, w_light, w_view)
-    )
-    scalars = [np.broadcast_to(a, shape).reshape(-1) for a in scalars]
-    result = None
-    for start in range(0, len(uv), CHUNK):
-        part = slice(start, start + CHUNK)
-        valid = conventions.valid_directions(w_light[part]) & conventions.valid_directions(w_view[part])
+    vectors, numbers = [real(a) for a in (uv, w_light, w_view)], [real(a) for a in scalars]
+    shape = np.broadcast_shapes(*(a.shape[:-1] for a in vectors), *(a.shape for a in numbers))
+    points: list[np.ndarray] = []
+    points += [np.broadcast_to(a, (*shape, a.shape[-1])).reshape(-1, a.shape[-1]) for a in vectors]
+    points += [np.broadcast_to(a, shape).reshape(-1) for a in numbers]
+    n, result = len(points[0]), None
+    for start in range(0, n, CHUNK):
+        part = [a[start : start + CHUNK] for a in points]
+        valid = conventions.valid_directions(part[1]) & conventions.valid_directions(part[2])
         if not valid.any():
             continue
-        points = (a[part][valid] for a in (uv, w_light, w_view, *scalars))
-        value = lookup(*points)
+        value = lookup(*(a[valid] for a in part))
         if result is None:
             # In the precision that the lookup kept: single, where :func:`computing_in` asks for it.
-            result = np.zeros((len(uv), 3), value.dtype)
-        result[part][valid] = value
+            result = np.zeros((n, 3), value.dtype)
+        result[start : start + CHUNK][valid] = value
     if result is None:
-        result = np.zeros((len(uv), 3), uv.dtype)
+        result = np.zeros((n, 3), points[0].dtype)
     return result.reshape(*shape, 3)
 
 
-def direction_arrays(views, lights):
+def direction_arrays(views: DirectionSet, lights: DirectionSet) -> dict[str, np.ndarray]:
     """The direction tables of two sets, as every representation stores them."""
     result = {}
     for prefix, directions in (("view", views), ("light", lights)):
@@ -141,7 +161,7 @@ def direction_arrays(views, lights):
     return result
 
 
-def packed(array):
+def packed(array: np.ndarray) -> np.ndarray:
     """``array`` with its last axis padded by zeros to a multiple of 4."""
     missing = -array.shape[-1] % 4
     if not missing:
@@ -149,12 +169,12 @@ def packed(array):
     return np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, missing)])
 
 
-def packed_arrays(arrays, **tables):
+def packed_arrays(arrays: Mapping[str, np.ndarray], **tables: np.ndarray) -> dict[str, np.ndarray]:
     """Port layout of ``arrays`` with the ``tables`` that are laid out anew in place of their namesakes."""
     return {name: packed(tables.get(name, array)) for name, array in arrays.items()}
 
 
-def base_meta(method, btf, parameters, *, filter_type="bilinear"):
+def base_meta(method: str, btf: SampledBTF, parameters: Facts, *, filter_type: str = "bilinear") -> Facts:
     """The meta that every fit starts from."""
     return meta_for(
         method,
@@ -167,7 +187,16 @@ def base_meta(method, btf, parameters, *, filter_type="bilinear"):
     )
 
 
-def meta_for(method, texels, views, lights, parameters, *, filter_type="bilinear", parent=None):
+def meta_for(
+    method: str,
+    texels: Sequence[int],
+    views: DirectionSet,
+    lights: DirectionSet,
+    parameters: Facts,
+    *,
+    filter_type: str = "bilinear",
+    parent: Facts | None = None,
+) -> Facts:
     """The same for maps that were not fitted to a sampled BTF: its directions, texels and attributes one by one."""
     from btfref.provenance import versions
 
@@ -185,10 +214,10 @@ def meta_for(method, texels, views, lights, parameters, *, filter_type="bilinear
 
 
 #: Storage types of float maps by name.
-STORAGE = {"half": np.float16, "float": np.float32}
+STORAGE: dict[str, type[np.floating]] = {"half": np.float16, "float": np.float32}
 
 
-def stored(name, array, storage):
+def stored(name: str, array: np.ndarray, storage: str) -> np.ndarray:
     """``array`` in the type that ``storage`` ("half" or "float") names.
 
     Raises
@@ -210,7 +239,7 @@ def stored(name, array, storage):
     return array.astype(STORAGE[storage])
 
 
-def positive_integer(name, value):
+def positive_integer(name: str, value: object) -> int:
     """``value`` as an int of at least 1.
 
     Raises

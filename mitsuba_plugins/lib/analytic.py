@@ -5,16 +5,23 @@ See :mod:`btfref.representations.analytic.light_functions` and :mod:`btfref.nume
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 
 from btfref.numerics.powers import FLOOR, LIMIT_LOG2, LOWEST_LOG2
 
+if TYPE_CHECKING:
+    from btfref.types import JitArray
+    from mitsuba_plugins.lib.lookup import Neighbour
+
+
 #: Below this |f|, log2(1 + f) comes from a series in f / (2 + f): 1 + f would round what a large exponent multiplies.
 _NEAR_ONE = 0.29
 
 
-def held(w, edge):
+def held(w: JitArray, edge: float) -> tuple[JitArray, JitArray]:
     """As :func:`btfref.representations.analytic.light_functions.held`: the raised direction and the fade."""
     if edge <= 0:
         return w, mi.Float(1)
@@ -24,13 +31,13 @@ def held(w, edge):
     return mi.Vector3f(w.x * scale, w.y * scale, dr.maximum(w.z, edge)), dr.minimum(w.z * (1 / edge), 1)
 
 
-def safe_power(base, exponent):
+def safe_power(base: JitArray, exponent: JitArray) -> JitArray:
     """As :func:`btfref.numerics.powers.safe_power`."""
     there = base >= FLOOR
     return _from_log(dr.log2(dr.select(there, base, 1)), exponent, there)
 
 
-def lobe_power(t, light, n):
+def lobe_power(t: JitArray, light: JitArray, n: JitArray) -> JitArray:
     """As :func:`btfref.numerics.powers.lobe_power`."""
     scale = dr.maximum(dr.maximum(dr.abs(t.x), dr.abs(t.y)), dr.abs(t.z))
     there = scale >= FLOOR
@@ -40,7 +47,7 @@ def lobe_power(t, light, n):
     return _from_log(dr.log2(scale) + dr.log2(dr.select(there, cosine, 1)), n, there)
 
 
-def unit_lobe(axis, light, n):
+def unit_lobe(axis: JitArray, light: JitArray, n: JitArray) -> JitArray:
     """As :func:`btfref.numerics.powers.unit_lobe`."""
     h = 0.5 * dr.squared_norm(axis - light)
     there = 1 - h >= FLOOR
@@ -49,7 +56,7 @@ def unit_lobe(axis, light, n):
     return _from_log(dr.select(near, _log2_near_one(dr.select(near, -h, 0)), far), n, there)
 
 
-def _log2_near_one(f):
+def _log2_near_one(f: JitArray) -> JitArray:
     s = f / (2 + f)
     z = s * s
     # 2 log2(e) atanh(s), the series up to s⁹: the next term is 2e-9 of it.
@@ -59,24 +66,24 @@ def _log2_near_one(f):
     return 2.8853900817779268 * s * p
 
 
-def _from_log(log, exponent, there):
+def _from_log(log: JitArray, exponent: JitArray, there: JitArray) -> JitArray:
     product = dr.clip(log * exponent, LOWEST_LOG2, LIMIT_LOG2)
     return dr.select(there & (product > LOWEST_LOG2), dr.exp2(product), 0)
 
 
-def parabolic_axis(s, t):
+def parabolic_axis(s: JitArray, t: JitArray) -> JitArray:
     """As :func:`btfref.representations.analytic.rf_lobes.parabolic_axis`."""
     r2 = dr.fma(s, s, t * t)
     scale = 1 / (1 + r2)
     return mi.Vector3f(2 * s * scale, 2 * t * scale, (1 - r2) * scale)
 
 
-def single(neighbours):
+def single(neighbours: list[Neighbour]) -> list[tuple[JitArray, JitArray]]:
     """Samples of a stencil one by one: a list of (index, weight)."""
     return [pair for neighbour in neighbours for pair in neighbour.single()]
 
 
-def packet(table, entry, width, active=True):
+def packet(table: JitArray, entry: JitArray, width: int, active: JitArray = True) -> list[JitArray]:
     """``width`` floats of an entry, a multiple of 4, in a list."""
     quads = [dr.gather(mi.Vector4f, table, entry * (width // 4) + i, active) for i in range(width // 4)]
     return [quad[k] for quad in quads for k in range(4)]

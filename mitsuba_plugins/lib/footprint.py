@@ -7,11 +7,18 @@ present but zero), so the pixel's cone stands in for them: its angle and apex co
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from btfref.numerics.footprint import ANISOTROPY, BLUR, TINY
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from btfref.types import JitArray
 
 
 class LevelOfDetail:
@@ -35,7 +42,16 @@ class LevelOfDetail:
         Rows and columns of level 0.
     """
 
-    def __init__(self, mode, bias, unit, pixel_angle, camera, affine, texels):
+    def __init__(
+        self,
+        mode: str,
+        bias: float,
+        unit: float,
+        pixel_angle: float,
+        camera: Sequence[float] | None,
+        affine: list[list[float]],
+        texels: tuple[int, int],
+    ) -> None:
         self.mode, self.bias = mode, float(bias)
         # Data, not code: a moved camera needs no new kernel.
         self.pixel_angle = mi.Float(float(pixel_angle))
@@ -47,7 +63,7 @@ class LevelOfDetail:
             [float(a) * n for a in row[:2]] for row, n in zip(affine, (columns, rows), strict=True)
         ]
 
-    def __call__(self, si):
+    def __call__(self, si: JitArray) -> dict[str, JitArray]:
         """Level of detail and the lookups along the footprint.
 
         Returns
@@ -75,7 +91,7 @@ class LevelOfDetail:
         rows, columns = self.texels
         return {"lod": self.bias + lod, "step": mi.Vector2f(step.x / columns, step.y / rows), "ratio": ratio}
 
-    def _slanted(self, si):
+    def _slanted(self, si: JitArray) -> tuple[JitArray, JitArray, JitArray]:
         """Squared axes in texels of a unit disk across the ray, as the surface stretches it."""
         dp_du, dp_dv = mi.Vector3f(si.dp_du), mi.Vector3f(si.dp_dv)
         e, f, g = dr.squared_norm(dp_du), dr.dot(dp_du, dp_dv), dr.squared_norm(dp_dv)
@@ -93,14 +109,14 @@ class LevelOfDetail:
             dr.fma(along_v * along_v, stretch, dr.squared_norm(v)),
         )
 
-    def traverse(self, callback):
+    def traverse(self, callback: JitArray) -> None:
         """Expose what changes with the camera."""
         if self.mode != "none":
             callback.put("pixel_angle", self.pixel_angle, mi.ParamFlags.NonDifferentiable)
             callback.put("camera", self.camera, mi.ParamFlags.NonDifferentiable)
 
 
-def ellipse_footprint(uu, uv, vv):
+def ellipse_footprint(uu: JitArray, uv: JitArray, vv: JitArray) -> tuple[JitArray, JitArray, JitArray]:
     """As :func:`btfref.numerics.footprint.ellipse_footprint`."""
     # Far beyond any texture, but products of two stay finite.
     uu, uv, vv = (dr.clip(a, -1e15, 1e15) for a in (uu, uv, vv))
@@ -115,11 +131,11 @@ def ellipse_footprint(uu, uv, vv):
     return 0.5 * dr.log2(1 + square * (1 / BLUR)), step, ratio
 
 
-def probes(ratio):
+def probes(ratio: JitArray) -> tuple[JitArray, Callable[[JitArray], JitArray]]:
     """Lookups along a footprint: how many on each side of the middle, and a function that weighs the j-th."""
     half = 0.5 * ratio
 
-    def weight(j):
+    def weight(j: JitArray) -> JitArray:
         return dr.clip(half + 0.5 - dr.abs(mi.Float(j)), 0, 1) / ratio
 
     return mi.Int32(dr.ceil(half - 0.5)), weight

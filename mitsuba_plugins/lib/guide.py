@@ -8,12 +8,21 @@ exactly as by cosine. Between measured views the tables are blended with the int
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from btfref.numerics.sphere import interpolation
 from btfref.representations.protocol import HasLevels
+
+if TYPE_CHECKING:
+    from btfref.numerics.sphere.interpolation import Interpolation
+    from btfref.representations.protocol import Representation
+    from btfref.types import JitArray
+    from mitsuba_plugins.lib.lookup import DirectionTable
+
 
 #: Cells in sin² θ and in φ. Finer cells would resolve more than directions 15° apart contain.
 N_RADIAL, N_AZIMUTH = 8, 32
@@ -30,7 +39,7 @@ COSINE_SHARE = 0.4
 _SUBSAMPLES = 4
 
 
-def cell_directions():
+def cell_directions() -> np.ndarray:
     """Cosine-distributed directions that fill the cells, shape (N_CELLS, points, 3)."""
     s = (np.arange(_SUBSAMPLES) + 0.5) / _SUBSAMPLES
     radial = (np.arange(N_RADIAL)[:, None, None, None] + s[None, None, :, None]) / N_RADIAL
@@ -41,7 +50,7 @@ def cell_directions():
     return w.reshape(N_CELLS, -1, 3)
 
 
-def cell_densities(mean, lights):
+def cell_densities(mean: np.ndarray, lights: Interpolation) -> np.ndarray:
     """Relative densities of the cells.
 
     Parameters
@@ -72,7 +81,7 @@ def cell_densities(mean, lights):
     return (COSINE_SHARE + (1 - COSINE_SHARE) * density).astype(np.float32)
 
 
-def alias_tables(weights, bits=ALIAS_BITS):
+def alias_tables(weights: np.ndarray, bits: int = ALIAS_BITS) -> np.ndarray:
     """Alias tables (Walker 1977, in Vose's construction, all rows at once).
 
     Parameters
@@ -112,7 +121,9 @@ def alias_tables(weights, bits=ALIAS_BITS):
     return np.minimum(steps, most - 1) << bits | alias.astype(np.uint32)
 
 
-def drawn(tables, first, count, bits, sample):
+def drawn(
+    tables: JitArray, first: JitArray, count: int, bits: int, sample: JitArray
+) -> tuple[JitArray, JitArray]:
     """A cell of an alias table, and a number in [0, 1) that is uniform again.
 
     Parameters
@@ -151,7 +162,7 @@ class LightGuide:
         "cosine" ignores the data: the yardstick that the guide is measured against.
     """
 
-    def __init__(self, representation, views, sampling):
+    def __init__(self, representation: Representation, views: DirectionTable, sampling: str) -> None:
         if sampling == "data" and isinstance(representation, HasLevels):
             levels = range(representation.sampling_levels)
             tables = [representation.sampling_tables(level) for level in levels]
@@ -177,7 +188,7 @@ class LightGuide:
         self.sizes = mi.UInt32(np.array(sizes, np.uint32).ravel())
         dr.eval(self.group, self.density, self.alias, self.sizes)
 
-    def _first_table(self, uv, lod):
+    def _first_table(self, uv: JitArray, lod: JitArray) -> JitArray:
         """Index of the tables of the group of the texel, of the level nearest to ``lod`` where there are levels."""
         if self.single_group:
             return mi.UInt32(0)
@@ -192,7 +203,9 @@ class LightGuide:
             texel = first + texel
         return dr.gather(mi.UInt32, self.group, texel) * self.n_views
 
-    def neighbours(self, uv, w_view, lod=None):
+    def neighbours(
+        self, uv: JitArray, w_view: JitArray, lod: JitArray = None
+    ) -> list[tuple[JitArray, JitArray]]:
         """Tables that the view direction blends, as a list of (table, weight); weights sum to 1."""
         first = self._first_table(uv, lod)
         return [
@@ -201,7 +214,9 @@ class LightGuide:
             for view, weight in neighbour.single()
         ]
 
-    def pdf(self, neighbours, w_light, active):
+    def pdf(
+        self, neighbours: list[tuple[JitArray, JitArray]], w_light: JitArray, active: JitArray
+    ) -> JitArray:
         """Density with respect to solid angle in 1/sr."""
         radial = dr.fma(w_light.x, w_light.x, w_light.y * w_light.y)
         turn = dr.atan2(w_light.y, w_light.x) * (0.5 / np.pi)
@@ -215,7 +230,9 @@ class LightGuide:
             density = dr.fma(value, weight, density)
         return dr.select(active, density * dr.maximum(w_light.z, 0) * dr.inv_pi, 0)
 
-    def sample(self, neighbours, sample1, sample2):
+    def sample(
+        self, neighbours: list[tuple[JitArray, JitArray]], sample1: JitArray, sample2: JitArray
+    ) -> JitArray:
         """A light direction with density :meth:`pdf`.
 
         Parameters

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 
+from btfref.types import JitArray
 from mitsuba_plugins.lib.lookup import texel_position
+
+if TYPE_CHECKING:
+    from btfref.types import Facts
+
 
 #: Stands for "never": far beyond every ray parameter, which is at most 1.
 _NEVER = 1e30
+
+
+#: Column and row of a cell, position in it, height.
+Hit = tuple[JitArray, JitArray, JitArray]
 
 
 class HeightField:
@@ -24,20 +35,20 @@ class HeightField:
         ``top``, ``bottom``, ``tangent_limit``, ``lift``, ``maximum_steps``.
     """
 
-    def __init__(self, cells, shape, constants):
+    def __init__(self, cells: JitArray, shape: tuple[int, int], constants: Facts) -> None:
         self.cells = mi.Float(dr.detach(cells))
         dr.eval(self.cells)
         self.rows, self.columns = shape
         self.constants = constants
         self.depth = constants["top"] - constants["bottom"]
 
-    def tangents(self, w):
+    def tangents(self, w: JitArray) -> JitArray:
         """``w_xy / w_z`` held at the limit."""
         across = dr.sqrt(dr.fma(w.x, w.x, w.y * w.y))
         scale = 1 / dr.maximum(w.z, across * (1 / self.constants["tangent_limit"]))
         return mi.Vector2f(w.x * scale, w.y * scale)
 
-    def view_hit(self, uv, w, active):
+    def view_hit(self, uv: JitArray, w: JitArray, active: JitArray) -> Hit:
         """First point on the ray towards ``w`` through ``uv`` at z = 0: (column, row), position in it, height."""
         size = mi.Vector2f(self.columns, self.rows)
         top, depth = self.constants["top"], self.depth
@@ -55,7 +66,9 @@ class HeightField:
         cell = self._wrapped(cell + crossed)
         return cell, local, self._patch(cell, local, active)[0]
 
-    def lit(self, cell, local, height, w, active):
+    def lit(
+        self, cell: JitArray, local: JitArray, height: JitArray, w: JitArray, active: JitArray
+    ) -> JitArray:
         """Whether a point sees the direction ``w``."""
         if self.depth == 0:
             return mi.Bool(True)
@@ -66,12 +79,14 @@ class HeightField:
         s, _ = self._march(cell, local, travel, height, rise, lift, active & ~above)
         return above | (s > 1)
 
-    def _wrapped(self, cell):
+    def _wrapped(self, cell: JitArray) -> JitArray:
         """A cell of the tile; cells are floats, which hold these integers exactly."""
         size = mi.Vector2f(self.columns, self.rows)
         return cell - size * dr.floor((cell + 0.5) / size)
 
-    def _patch(self, cell, at, active):
+    def _patch(
+        self, cell: JitArray, at: JitArray, active: JitArray
+    ) -> tuple[JitArray, JitArray, JitArray, JitArray]:
         """Height at a position in a cell, and the patch's coefficients of x, y and xy."""
         index = mi.UInt32(dr.fma(cell.y, self.columns, cell.x))
         h00, h10, h01, h11 = dr.gather(mi.Vector4f, self.cells, index, active)
@@ -79,7 +94,16 @@ class HeightField:
         hxy = (h11 - h10) - hy
         return dr.fma(dr.fma(hxy, at.x, hy), at.y, dr.fma(hx, at.x, h00)), hx, hy, hxy
 
-    def _march(self, cell, start, travel, z0, dz, lift, active):
+    def _march(
+        self,
+        cell: JitArray,
+        start: JitArray,
+        travel: JitArray,
+        z0: JitArray,
+        dz: JitArray,
+        lift: JitArray,
+        active: JitArray,
+    ) -> tuple[JitArray, JitArray]:
         """Parameter of the first hit, ``_NEVER`` where there is none up to 1, and the cells crossed before it."""
         moving = mi.Vector2f(dr.select(travel != 0, 1, 0))
         inverse = dr.select(travel != 0, 1 / dr.select(travel != 0, travel, 1), 0)
@@ -88,8 +112,22 @@ class HeightField:
         limit = self.constants["maximum_steps"]
 
         def body(
-            going, s, crossed, hit, n, cell, start, travel, z0, dz, inverse, forward, step, moving, lift
-        ):
+            going: JitArray,
+            s: JitArray,
+            crossed: JitArray,
+            hit: JitArray,
+            n: JitArray,
+            cell: JitArray,
+            start: JitArray,
+            travel: JitArray,
+            z0: JitArray,
+            dz: JitArray,
+            inverse: JitArray,
+            forward: JitArray,
+            step: JitArray,
+            moving: JitArray,
+            lift: JitArray,
+        ) -> tuple[JitArray, ...]:
             local = dr.clip(dr.fma(travel, s, start - crossed), 0, 1)
             height, hx, hy, hxy = self._patch(self._wrapped(cell + crossed), local, going)
             f0 = dr.fma(dz, s, z0) - height + lift
@@ -151,7 +189,7 @@ class HeightField:
         return state[3], state[2]
 
 
-def first_root(f0, f1, f2):
+def first_root(f0: JitArray, f1: JitArray, f2: JitArray) -> JitArray:
     """As :func:`btfref.numerics.heightfield.first_root`."""
     disc = dr.fma(f1, f1, -4 * f2 * f0)
     root = dr.sqrt(dr.maximum(disc, 0))

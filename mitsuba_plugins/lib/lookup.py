@@ -5,6 +5,8 @@ Everything here is recorded, never executed per sample: no data-dependent Python
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -12,18 +14,26 @@ import numpy as np
 from btfref.conventions import LEAST_Z, SQUARED_LENGTHS
 from btfref.numerics.sphere.interpolation import MISSING
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import ArrayLike
+
+    from btfref.types import JitArray
+
+
 #: The largest finite float32.
 LARGEST = float(np.finfo(np.float32).max)
 
 
-def valid_directions(w):
+def valid_directions(w: JitArray) -> JitArray:
     """As :func:`btfref.conventions.valid_directions`."""
     low, high = SQUARED_LENGTHS
     square = dr.squared_norm(w)
     return (w.z >= LEAST_Z) & (square > low) & (square < high)
 
 
-def malformed(uv, w_light, w_view):
+def malformed(uv: JitArray, w_light: JitArray, w_view: JitArray) -> tuple[JitArray, JitArray]:
     """Where a lookup asks for what is none, as :func:`btfref.conventions.malformed` counts it.
 
     Returns
@@ -42,7 +52,7 @@ def malformed(uv, w_light, w_view):
 QUARTER_PI = (0.785398185253143310546875, -2.18556948040e-8)
 
 
-def angle_of(y, x):
+def angle_of(y: JitArray, x: JitArray) -> tuple[JitArray, JitArray]:
     """Angle of (x, y) as a multiple of an eighth turn in [0, 8] plus a remainder of at most π/8 in magnitude.
 
     The sum of the two would be rounded to a float32 of magnitude 2π; steps between directions multiply that error.
@@ -68,7 +78,7 @@ def angle_of(y, x):
     return eighths, rest
 
 
-def texel_position(uv, shape, shift):
+def texel_position(uv: JitArray, shape: tuple[JitArray, JitArray], shift: float) -> tuple[JitArray, JitArray]:
     """Whole part (wrapped, as floats) and fraction of ``uv * size - shift``; not finite counts as 0."""
     size = mi.Vector2f(shape[1], shape[0])
     uv = dr.select(dr.isfinite(uv), uv, 0)
@@ -81,7 +91,9 @@ def texel_position(uv, shape, shift):
     return low - size * dr.floor((low + 0.5) / size), f
 
 
-def texel_stencil(uv, shape, filter_type):
+def texel_stencil(
+    uv: JitArray, shape: tuple[JitArray, JitArray], filter_type: str
+) -> tuple[list[JitArray], list[JitArray]]:
     """As :func:`btfref.conventions.texel_stencil`: lists of indices and weights."""
     rows, columns = shape
     low, f = texel_position(uv, shape, 0.0 if filter_type == "nearest" else 0.5)
@@ -98,11 +110,13 @@ def texel_stencil(uv, shape, filter_type):
 class Neighbour:
     """A sample with its weight, and the next sample on the same ring with its own (None where there is no ring)."""
 
-    def __init__(self, index, weight, following=None, following_weight=None):
+    def __init__(
+        self, index: JitArray, weight: JitArray, following: JitArray = None, following_weight: JitArray = None
+    ) -> None:
         self.index, self.weight = index, weight
         self.following, self.following_weight = following, following_weight
 
-    def single(self):
+    def single(self) -> list[tuple[JitArray, JitArray]]:
         """The samples one by one: a list of (index, weight)."""
         pairs = [(self.index, self.weight)]
         if self.following is not None:
@@ -113,17 +127,17 @@ class Neighbour:
 class RingTable:
     """Port of :class:`btfref.numerics.sphere.interpolation.RingInterpolation`."""
 
-    def __init__(self, rings):
+    def __init__(self, rings: ArrayLike) -> None:
         self.rings = np.asarray(rings, float)
 
-    def following(self):
+    def following(self) -> np.ndarray:
         """For each sample the next one on its ring, shape (n,)."""
         result = []
         for _, _, count, first in self.rings.astype(int):
             result += [first + (i + 1) % count for i in range(count)]
         return np.array(result)
 
-    def stencil(self, w, *, hold=True):
+    def stencil(self, w: JitArray, *, hold: bool = True) -> list[Neighbour]:
         """List of :class:`Neighbour`: one on the lower and one on the upper ring."""
         polar = angle_of(dr.sqrt(dr.fma(w.x, w.x, w.y * w.y)), w.z)
         theta = dr.fma(polar[0], QUARTER_PI[0], polar[1])
@@ -132,7 +146,7 @@ class RingTable:
         # Tables this small are cheaper as chains of selects than as gathers.
         above = [theta >= float(ring[0]) for ring in self.rings[1:]]
 
-        def choose(values):
+        def choose(values: Sequence[float] | np.ndarray) -> JitArray:
             values = [float(v) for v in values]
             result = mi.Float(values[0])
             for mask, value, previous in zip(above, values[1:], values, strict=False):
@@ -179,27 +193,27 @@ class RingTable:
 class TriangleTable:
     """Port of :class:`btfref.numerics.sphere.interpolation.TriangleInterpolation`."""
 
-    def __init__(self, triangles, cells):
+    def __init__(self, triangles: np.ndarray, cells: np.ndarray) -> None:
         self.n_triangles, self.n_cells = len(triangles), len(cells)
         self.triangles = mi.Float(np.asarray(triangles, np.float32).ravel())
         self.cells = mi.UInt32(np.asarray(cells, np.uint32).ravel())
 
-    def following(self):
+    def following(self) -> None:
         """There are no rings."""
         return None
 
-    def _row(self, triangle, active=True):
+    def _row(self, triangle: JitArray, active: JitArray = True) -> list[JitArray]:
         packets = [dr.gather(mi.Vector4f, self.triangles, triangle * 6 + i, active) for i in range(6)]
         return [p[k] for p in packets for k in range(4)]
 
     @staticmethod
-    def _barycentric(row, w):
+    def _barycentric(row: list[JitArray], w: JitArray) -> tuple[JitArray, JitArray, JitArray]:
         from_a = w - mi.Vector3f(row[0:3])
         from_b = w - mi.Vector3f(row[3:6])
         n_a, n_b, n_c = (mi.Vector3f(row[i : i + 3]) for i in (6, 9, 12))
         return dr.dot(n_a, from_b), dr.dot(n_b, from_a), dr.dot(n_c, from_a)
 
-    def stencil(self, w, *, hold=True):
+    def stencil(self, w: JitArray, *, hold: bool = True) -> list[Neighbour]:
         """List of three :class:`Neighbour` without followers."""
         w = mi.Vector3f(dr.detach(w))
         s = w.x / (1 + w.z)
@@ -209,7 +223,9 @@ class TriangleTable:
         row = mi.UInt32(dr.clip((t + 1) * half, 0, self.n_cells - 1))
         start = dr.gather(mi.UInt32, self.cells, row * self.n_cells + column)
 
-        def body(triangle, steps, walking, w):
+        def body(
+            triangle: JitArray, steps: JitArray, walking: JitArray, w: JitArray
+        ) -> tuple[JitArray, JitArray, JitArray, JitArray]:
             data = self._row(triangle, walking)
             a, b, c = self._barycentric(data, w)
             worst = dr.minimum(a, dr.minimum(b, c))
@@ -241,12 +257,12 @@ class TriangleTable:
 class ResidentTable:
     """Port of :class:`btfref.numerics.sphere.interpolation.ResidentInterpolation`: what is not kept gives no number."""
 
-    def __init__(self, inner, slots):
+    def __init__(self, inner: RingTable | TriangleTable, slots: np.ndarray) -> None:
         self.inner, self._table = inner, np.ascontiguousarray(slots[:, 0])
         self.slots = mi.UInt32(self._table)
         dr.eval(self.slots)
 
-    def following(self):
+    def following(self) -> np.ndarray | None:
         """The slot of the next sample on each kept one's ring; of one that is not kept, its own."""
         following = self.inner.following()
         if following is None:
@@ -255,10 +271,10 @@ class ResidentTable:
         after = self._table[following[kept]]
         return np.where(after == MISSING, self._table[kept], after).astype(np.int64)
 
-    def stencil(self, w, *, hold=True):
+    def stencil(self, w: JitArray, *, hold: bool = True) -> list[Neighbour]:
         """As the table's own, in slots."""
 
-        def kept(index, weight):
+        def kept(index: JitArray, weight: JitArray) -> tuple[JitArray, JitArray]:
             slot = dr.gather(mi.UInt32, self.slots, index)
             absent = slot == MISSING
             return dr.select(absent, 0, slot), dr.select(absent & (weight > 0), dr.nan, weight)
@@ -276,8 +292,13 @@ class ResidentTable:
         return result
 
 
-def direction_table(arrays, prefix):
+#: Port of an interpolation over directions.
+DirectionTable = RingTable | TriangleTable | ResidentTable
+
+
+def direction_table(arrays: dict[str, np.ndarray], prefix: str) -> DirectionTable:
     """The port of the interpolation whose tables are stored under ``prefix``."""
+    found: RingTable | TriangleTable
     if f"{prefix}_rings" in arrays:
         found = RingTable(arrays[f"{prefix}_rings"])
     else:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -10,6 +12,12 @@ from btfref.conventions import LUMINANCE
 from btfref.numerics.sphere.parabolic import texel_centres, texel_solid_angles
 from mitsuba_plugins.lib.guide import alias_tables, drawn
 from mitsuba_plugins.lib.proposals import COSINE_SHARE, folded
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from btfref.types import JitArray
+
 
 #: Cosine between view and half vector down to which light is the view's reflection: its density, p(h) / (4 k·h), is
 #: singular at 0. Below it, ever more half vectors are directions of light themselves.
@@ -25,7 +33,7 @@ class HalfVectors:
         Parabolic tables of p, as ports have them: three channels count.
     """
 
-    def __init__(self, ndf):
+    def __init__(self, ndf: ArrayLike) -> None:
         p = np.maximum(np.asarray(ndf, float)[..., :3], 0) @ LUMINANCE
         self.n = p.shape[-1]
         # A texel is as probable as the mean of what is interpolated in it. Those that the rim cuts are left to the
@@ -47,7 +55,7 @@ class HalfVectors:
         self.share, self.total = mi.Float(share.ravel()), mi.Float(total)
         dr.eval(self.alias, self.share, self.total)
 
-    def sample(self, material, sample):
+    def sample(self, material: JitArray, sample: JitArray) -> JitArray:
         """A half vector in its tangent frame."""
         count = self.n * self.n
         cell, x = drawn(self.alias, material * count, count, self.bits, sample.x)
@@ -56,7 +64,7 @@ class HalfVectors:
         r2 = dr.squared_norm(st)
         return mi.Vector3f(2 * st.x, 2 * st.y, 1 - r2) / (1 + r2)
 
-    def pdf(self, material, h, active):
+    def pdf(self, material: JitArray, h: JitArray, active: JitArray) -> JitArray:
         """Density of unit half vectors with respect to their solid angle; 0 on the lower side."""
         active = active & (h.z > 0)
         scale = 1 / (1 + dr.maximum(h.z, 0))
@@ -81,17 +89,24 @@ class Microfacets:
         Share of the half vectors, before the least share of the cosine.
     """
 
-    def __init__(self, tables, material, frame, w_view, gloss):
+    def __init__(
+        self,
+        tables: HalfVectors,
+        material: JitArray,
+        frame: tuple[JitArray, JitArray, JitArray],
+        w_view: JitArray,
+        gloss: JitArray,
+    ) -> None:
         self._tables, self._material, self._frame, self._view = tables, material, frame, w_view
         self._gloss = dr.clip(gloss, 0, 1 - COSINE_SHARE)
 
-    def pdf(self, w_light, active):
+    def pdf(self, w_light: JitArray, active: JitArray) -> JitArray:
         """Density in 1/sr."""
         active = active & (w_light.z > 0)
         mirrored = mi.Vector3f(w_light.x, w_light.y, -w_light.z)
         return dr.select(active, self._whole(w_light, active) + self._whole(mirrored, active), 0)
 
-    def _whole(self, w, active):
+    def _whole(self, w: JitArray, active: JitArray) -> JitArray:
         """Density over the whole sphere."""
         h = w + self._view
         length = dr.norm(h)
@@ -105,13 +120,13 @@ class Microfacets:
         diffuse = dr.maximum(dr.dot(w, self._frame[2]), 0) * dr.inv_pi
         return dr.lerp(diffuse, glossy, self._gloss)
 
-    def _local(self, w):
+    def _local(self, w: JitArray) -> JitArray:
         return mi.Vector3f(*(dr.dot(w, axis) for axis in self._frame))
 
-    def _density(self, facet, active):
+    def _density(self, facet: JitArray, active: JitArray) -> JitArray:
         return self._tables.pdf(self._material, facet, active)
 
-    def sample(self, sample1, sample2):
+    def sample(self, sample1: JitArray, sample2: JitArray) -> JitArray:
         """A direction of that density."""
         facet = self._tables.sample(self._material, sample2)
         tangent, bitangent, normal = self._frame
@@ -125,6 +140,6 @@ class Microfacets:
         return dr.normalize(folded(dr.select(sample1 < self._gloss, glossy, diffuse)))
 
 
-def _reflected_share(cosine):
+def _reflected_share(cosine: JitArray) -> JitArray:
     """Share of the half vectors at a cosine to the view at which it is reflected."""
     return dr.minimum(dr.abs(cosine) * (1 / LEAST_COSINE), 1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -10,14 +12,17 @@ from btfref.numerics.sphere.halfway import LENGTHEN, SHORT
 from btfref.representations.factored.definition import raised
 from mitsuba_plugins.lib.tables import HALF_LIMIT, HALF_SCALE, HALF_SHIFT, as_float32, read_packets, widened
 
+if TYPE_CHECKING:
+    from btfref.types import JitArray
 
-def half_sum(w_light, w_view):
+
+def half_sum(w_light: JitArray, w_view: JitArray) -> JitArray:
     """A vector along the half vector, whose square does not underflow."""
     h = w_light + w_view
     return h * dr.select(dr.max(dr.abs(h)) < SHORT, LENGTHEN, 1)
 
 
-def half_difference(w_light, w_view):
+def half_difference(w_light: JitArray, w_view: JitArray) -> tuple[JitArray, JitArray]:
     """As :func:`btfref.numerics.sphere.halfway.half_difference`."""
     h = half_sum(w_light, w_view)
     length = dr.norm(h)
@@ -28,7 +33,7 @@ def half_difference(w_light, w_view):
     return h, mi.Vector3f(dr.dot(w_light, tangent), dr.dot(w_light, bitangent), dr.dot(w_light, h))
 
 
-def bilinear_stencil(w, n):
+def bilinear_stencil(w: JitArray, n: int) -> tuple[list[JitArray], list[JitArray]]:
     """As :func:`btfref.numerics.sphere.parabolic.bilinear_stencil`: lists of four indices and weights."""
     scale = dr.norm(w) + w.z
     scale = dr.select(scale > 0, 1 / scale, 0)
@@ -47,7 +52,7 @@ def bilinear_stencil(w, n):
     )
 
 
-def unpacked(word):
+def unpacked(word: JitArray) -> tuple[list[JitArray], float]:
     """Three channels of a word of 8-bit codes, and the factor that makes numbers in [0, 1] of them."""
     return [mi.Float((word >> shift) & 255) for shift in (0, 8, 16)], 1 / 255
 
@@ -65,7 +70,7 @@ class ParabolicMaps:
         1 or 4: what the numbers in the maps are raised to.
     """
 
-    def __init__(self, values, power):
+    def __init__(self, values: JitArray, power: int) -> None:
         self.n, self.power = values.shape[1], power
         self.texels = self.n * self.n
         self.kind, self.values = dr.type_v(values.array), values.array
@@ -82,7 +87,9 @@ class ParabolicMaps:
         elif self.kind != dr.VarType.UInt32:
             self.values = as_float32(values)
 
-    def lookup(self, slice_index, stencil, active=True):
+    def lookup(
+        self, slice_index: JitArray, stencil: tuple[list[JitArray], list[JitArray]], active: JitArray = True
+    ) -> JitArray:
         """Bilinear lookup in a slice; a Color3f.
 
         Parameters
@@ -102,7 +109,7 @@ class ParabolicMaps:
             total = [dr.fma(c, weight, t) for c, t in zip(colour, total, strict=True)]
         return mi.Color3f(*total)
 
-    def _texel(self, texel, active):
+    def _texel(self, texel: JitArray, active: JitArray) -> tuple[list[JitArray], float]:
         """Three channels, and the factor that makes values of them."""
         if self.kind == dr.VarType.UInt32:
             return unpacked(dr.gather(mi.UInt32, self.values, texel, active))

@@ -7,11 +7,19 @@ there is mirrored up, so that no sample is lost and the density integrates to 1 
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mitsuba_plugins.lib.analytic import safe_power
+
+if TYPE_CHECKING:
+    from btfref.types import JitArray
+    from mitsuba_plugins.lib.guide import LightGuide
+    from mitsuba_plugins.protocol import Proposal
+
 
 #: Least share of cosine sampling beside lobes: lights below the outermost measured ones are held, which the lobes
 #: themselves do not follow, and bounds the weight of a sample by 10 times that of cosine sampling.
@@ -21,14 +29,14 @@ COSINE_SHARE = 0.1
 class Guided:
     """The guide at one view: tables and their weights."""
 
-    def __init__(self, guide, tables):
+    def __init__(self, guide: LightGuide, tables: list[tuple[JitArray, JitArray]]) -> None:
         self._guide, self._tables = guide, tables
 
-    def pdf(self, w_light, active):
+    def pdf(self, w_light: JitArray, active: JitArray) -> JitArray:
         """Density in 1/sr."""
         return self._guide.pdf(self._tables, w_light, active)
 
-    def sample(self, sample1, sample2):
+    def sample(self, sample1: JitArray, sample2: JitArray) -> JitArray:
         """A direction of that density."""
         return self._guide.sample(self._tables, sample1, sample2)
 
@@ -44,15 +52,15 @@ class Mixture:
         Of the first, in [0, 1].
     """
 
-    def __init__(self, first, second, share):
+    def __init__(self, first: Proposal, second: Proposal, share: JitArray) -> None:
         self._first, self._second, self._share = first, second, mi.Float(share)
 
-    def pdf(self, w_light, active):
+    def pdf(self, w_light: JitArray, active: JitArray) -> JitArray:
         """Density in 1/sr."""
         other = self._second.pdf(w_light, active)
         return dr.lerp(other, self._first.pdf(w_light, active), self._share)
 
-    def sample(self, sample1, sample2):
+    def sample(self, sample1: JitArray, sample2: JitArray) -> JitArray:
         """A direction of that density."""
         first = sample1 < self._share
         rest = dr.select(first, sample1 / self._share, (sample1 - self._share) / (1 - self._share))
@@ -71,7 +79,7 @@ class CosineLobes:
         Unit axis, exponent ≥ 0 and peak of each, ≥ 0.
     """
 
-    def __init__(self, diffuse, lobes):
+    def __init__(self, diffuse: JitArray, lobes: list[tuple[JitArray, JitArray, JitArray]]) -> None:
         amounts = []
         for axis, exponent, peak in lobes:
             # What is above the horizon of a lobe's integral 2π / (n + 1): exact for n = 1.
@@ -89,7 +97,7 @@ class CosineLobes:
         ]
         self._cosine = dr.select(known, diffuse * scale, 1)
 
-    def pdf(self, w_light, active):
+    def pdf(self, w_light: JitArray, active: JitArray) -> JitArray:
         """Density in 1/sr."""
         density = self._cosine * dr.inv_pi * w_light.z
         for axis, exponent, share in self._lobes:
@@ -98,7 +106,7 @@ class CosineLobes:
             density = dr.fma(share * (exponent + 1) * (0.5 / np.pi), both, density)
         return dr.select(active & (w_light.z > 0), density, 0)
 
-    def sample(self, sample1, sample2):
+    def sample(self, sample1: JitArray, sample2: JitArray) -> JitArray:
         """A direction of that density."""
         axis, exponent, cumulative = mi.Vector3f(0, 0, 1), mi.Float(1), self._cosine
         for following, n, share in self._lobes:
@@ -115,6 +123,6 @@ class CosineLobes:
         return folded(w)
 
 
-def folded(w):
+def folded(w: JitArray) -> JitArray:
     """A direction, mirrored up where it lies below the horizon; never on it."""
     return mi.Vector3f(w.x, w.y, dr.maximum(dr.abs(w.z), 1e-7))

@@ -5,9 +5,16 @@ Everything here is recorded, never executed per sample: no data-dependent Python
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+if TYPE_CHECKING:
+    from btfref.types import JitArray
+    from mitsuba_plugins.lib.lookup import Neighbour
+
 
 #: Half tables are multiplied by this power of two when they are packed: the smallest subnormal half becomes normal.
 HALF_SHIFT = 2.0**10
@@ -25,7 +32,7 @@ HALF_SCALE = 2.0**112 / HALF_SHIFT
 UNROLLED_WIDTH = 8
 
 
-def tensor(array):
+def tensor(array: np.ndarray) -> JitArray:
     """A Dr.Jit tensor of the array's own type (float16, float32 or uint32); uint8 in words of four codes."""
     array = np.ascontiguousarray(array)
     if array.dtype == np.uint8:
@@ -51,18 +58,18 @@ class PairTable:
     two of the four lights of a lookup; elsewhere two neighbouring values of an entry.
     """
 
-    def __init__(self, values, following):
+    def __init__(self, values: JitArray, following: np.ndarray | None) -> None:
         self.following = following
         self.update(values)
 
-    def update(self, values):
+    def update(self, values: JitArray) -> None:
         """Take new values; differentiable ones are kept as they are, so that gradients reach them."""
         self.outer, self.n_views, self.n_lights, self.width = values.shape
         self.words, self.values = None, None
         packable = dr.type_v(values.array) == dr.VarType.Float16 and not dr.grad_enabled(values.array)
         halves = values.numpy() if packable else None
         # Moved bits make a number of NaN, which stands for what is not there: such tables stay as they are.
-        if not packable or not np.abs(halves).max() <= HALF_LIMIT:
+        if halves is None or not np.abs(halves).max() <= HALF_LIMIT:
             self.values = as_float32(values)
             return
         halves = (halves * np.float16(HALF_SHIFT)).view(np.uint16)
@@ -74,7 +81,15 @@ class PairTable:
         self.words = dr.reinterpret_array(mi.Float, mi.UInt32(words.ravel()))
         dr.eval(self.words)
 
-    def combine(self, outer, views, lights, coefficients, active=True, total=None):
+    def combine(
+        self,
+        outer: JitArray,
+        views: list[Neighbour],
+        lights: list[Neighbour],
+        coefficients: list[JitArray],
+        active: JitArray = True,
+        total: JitArray = None,
+    ) -> JitArray:
         """Interpolate over views and lights, and combine the colours of an entry linearly.
 
         Parameters
@@ -104,7 +119,7 @@ class PairTable:
                 total = self._add_view(total, outer + view, weight, lights, coefficients, active)
             return total
 
-        def body(step, total):
+        def body(step: JitArray, total: JitArray) -> tuple[JitArray, JitArray]:
             view, weight = pairs[0]
             for i, (other, other_weight) in enumerate(pairs[1:], 1):
                 view, weight = dr.select(step == i, other, view), dr.select(step == i, other_weight, weight)
@@ -114,15 +129,25 @@ class PairTable:
             (mi.UInt32(0), total), lambda step, total: step < len(pairs), body, label="views"
         )[1]
 
-    def _blend(self, total, values, coefficients, weight):
+    def _blend(
+        self, total: JitArray, values: list[JitArray], coefficients: list[JitArray], weight: JitArray
+    ) -> JitArray:
         """``total`` plus the weighted combination of an entry's values; by default RGB colours back to back."""
         return _add(total, values, coefficients, weight)
 
-    def _needed(self, coefficients):
+    def _needed(self, coefficients: list[JitArray]) -> int:
         """How many of an entry's values these coefficients use."""
         return 3 * len(coefficients)
 
-    def _add_view(self, total, view, weight, lights, coefficients, active):
+    def _add_view(
+        self,
+        total: JitArray,
+        view: JitArray,
+        weight: JitArray,
+        lights: list[Neighbour],
+        coefficients: list[JitArray],
+        active: JitArray,
+    ) -> JitArray:
         """``total`` plus the contribution of one view, interpolated over lights."""
         base = view * self.n_lights
         for light in lights:
@@ -141,7 +166,7 @@ class PairTable:
                 total = self._blend(total, self._values(base + index, needed), coefficients, pair_weight)
         return total
 
-    def _values(self, entry, active):
+    def _values(self, entry: JitArray, active: JitArray) -> list[JitArray]:
         """The values of an entry one by one, not yet multiplied by ``HALF_SCALE``."""
         if self.words is None:
             return [mi.Float(value) for value in read_packets(self.values, entry, self.width, active)]
@@ -152,7 +177,7 @@ class PairTable:
         ]
 
 
-def widened(word):
+def widened(word: JitArray) -> tuple[JitArray, JitArray]:
     """The two halves of a word as float32, both to be multiplied by ``HALF_SCALE``."""
     word = dr.reinterpret_array(mi.UInt32, word)
     low = dr.reinterpret_array(mi.Float, ((word << 13) & 0x0FFFE000) | ((word << 16) & 0x80000000))
@@ -160,7 +185,7 @@ def widened(word):
     return low, high
 
 
-def _add(total, values, coefficients, weight):
+def _add(total: JitArray, values: list[JitArray], coefficients: list[JitArray], weight: JitArray) -> JitArray:
     """``total + weight Σ_j coefficient_j colour_j``: few live registers, whatever the number of coefficients."""
     result = []
     for channel in range(3):
@@ -171,16 +196,16 @@ def _add(total, values, coefficients, weight):
     return mi.Color3f(*result)
 
 
-def as_float32(values):
+def as_float32(values: JitArray) -> JitArray:
     """Values of a table as float32, which is read in packets; gradients pass the conversion."""
     result = mi.Float(values.array)
     dr.eval(result)
     return result
 
 
-def read_packets(array, entry, width, active=True):
+def read_packets(array: JitArray, entry: JitArray, width: int, active: JitArray = True) -> list[JitArray]:
     """``width`` consecutive values of entry ``entry``, gathered in the largest packets that fit."""
-    result = []
+    result: list[JitArray] = []
     while len(result) < width:
         # Packets must be aligned to their own size.
         if width % 16 == 0:

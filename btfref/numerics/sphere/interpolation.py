@@ -269,16 +269,18 @@ class ResidentInterpolation:
         return np.where(absent, 0, slot), weight
 
 
+#: What interpolates over a set of directions.
+Interpolation = RingInterpolation | TriangleInterpolation | ResidentInterpolation
+
+
 def whole(
-    interpolation: RingInterpolation | TriangleInterpolation | ResidentInterpolation,
+    interpolation: Interpolation,
 ) -> RingInterpolation | TriangleInterpolation:
     """The interpolation whose indices are samples, not slots: that inside of one of which only some are kept."""
     return interpolation.inner if isinstance(interpolation, ResidentInterpolation) else interpolation
 
 
-def from_arrays(
-    arrays: Mapping[str, np.ndarray], prefix: str
-) -> RingInterpolation | TriangleInterpolation | ResidentInterpolation:
+def from_arrays(arrays: Mapping[str, np.ndarray], prefix: str) -> Interpolation:
     """The interpolation whose tables are stored under ``prefix`` (see :meth:`RingInterpolation.arrays`).
 
     With a table ``{prefix}_slots`` its samples are the slots of what is kept: :class:`ResidentInterpolation`.

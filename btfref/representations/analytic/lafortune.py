@@ -11,6 +11,8 @@ A lobe is stored as coefficients in [−1, 1], exponent and peak, instead of as 
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from btfref.numerics.powers import FLOOR, safe_power
@@ -19,6 +21,19 @@ from btfref.precision import real
 from btfref.representations.analytic import light_functions
 from btfref.representations.analytic.lobe_start import exponent_limit
 from btfref.representations.lookup import base_meta, direction_arrays, positive_integer, stored
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import ModuleType
+
+    from numpy.typing import ArrayLike
+
+    from btfref.numerics.solvers.levenberg import Model, Samples
+    from btfref.numerics.sphere.directions import DirectionSet
+    from btfref.representations.analytic.light_functions import HeldStencils
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.types import Facts, JitArray, Progress
+
 
 #: "paper": Table 1's four lobes, in floats.
 PRESETS = {"paper": {"lobes": 4, "storage": "float"}}
@@ -40,22 +55,24 @@ class Representation(light_functions.AnalyticMaps):
     ``colour`` [row, column, 4]: chroma and ρ_d in 1/sr; and the direction tables.
     """  # noqa: D205
 
-    def evaluate(self, uv, w_light, w_view, *, lod=0.0):
+    def evaluate(
+        self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
+    ) -> np.ndarray:
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored. Never negative."""
         maps = flat_maps(self.maps)
 
-        def kernel(s):
+        def kernel(s: HeldStencils) -> np.ndarray:
             value = texel_values(maps, s)
             return np.einsum("nt,ntc,nt->nc", s.texel_weight, maps["colour"][s.texel, :3], value)
 
         return light_functions.evaluate_analytic(self, kernel, uv, w_light, w_view)
 
-    def luminance_tables(self, texels, views):
+    def luminance_tables(self, texels: np.ndarray, views: np.ndarray) -> np.ndarray:
         """Model of luminance at measured views and all measured lights, shape (n, n_views, n_lights)."""
         return luminance_tables(self.maps, texels, views)
 
 
-def flat_maps(maps):
+def flat_maps(maps: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The maps of the texels by flat index, as the definition computes; lobes as (n, k, 4)."""
     names = [name for name in maps if not name.startswith(("view_", "light_"))]
     flat = {name: real(maps[name].reshape(-1, maps[name].shape[-1])) for name in names}
@@ -63,7 +80,7 @@ def flat_maps(maps):
     return flat
 
 
-def texel_values(maps, s):
+def texel_values(maps: dict[str, np.ndarray], s: HeldStencils) -> np.ndarray:
     """``f l_z`` of each texel of a lookup, shape (N, T)."""
     product = (s.w_light * s.w_view)[:, None, None]
     lobes = maps["lobes"][s.texel]
@@ -71,7 +88,7 @@ def texel_values(maps, s):
     return s.w_light[:, None, 2] * (maps["colour"][s.texel, 3] + (maps["peaks"][s.texel] * power).sum(-1))
 
 
-def luminance_tables(maps, texels, views):
+def luminance_tables(maps: dict[str, np.ndarray], texels: np.ndarray, views: np.ndarray) -> np.ndarray:
     """See :meth:`Representation.luminance_tables`; float32."""
     lights = maps["light_directions"].astype(np.float32)
     product = maps["view_directions"][views].astype(np.float32)[:, None] * lights
@@ -84,7 +101,14 @@ def luminance_tables(maps, texels, views):
     return result * lights[:, 2]
 
 
-def lafortune_model(module, data, views, lights, n_lobes, factor=None):
+def lafortune_model(
+    module: ModuleType,
+    data: np.ndarray,
+    views: np.ndarray,
+    lights: np.ndarray,
+    n_lobes: int,
+    factor: np.ndarray | None = None,
+) -> Model:
     """Residuals and Jacobian for :func:`fit_batch`; a step is a pair of directions.
 
     Parameters
@@ -113,7 +137,7 @@ def lafortune_model(module, data, views, lights, n_lobes, factor=None):
     table = Float(np.concatenate([product, cosine], -1).ravel())
     factor = None if factor is None else Float(np.ascontiguousarray(factor, np.float32).ravel())
 
-    def model(p, fit):
+    def model(p: list[JitArray], fit: JitArray) -> tuple[Samples, list[JitArray]]:
         lobes, units = [], [Float(1)]
         for j in range(n_lobes):
             *c, log_exponent, peak = p[1 + 5 * j : 6 + 5 * j]
@@ -122,7 +146,7 @@ def lafortune_model(module, data, views, lights, n_lobes, factor=None):
             slope = peak * exponent
             units += [slope, slope, slope, slope * 0.6931471805599453, Float(1)]
 
-        def samples(step):
+        def samples(step: JitArray) -> list[tuple[JitArray, list[JitArray]]]:
             *w, scale = dr.gather(module.Array4f, table, step)
             if factor is not None:
                 scale = scale * dr.gather(Float, factor, dr.fma(fit, n_views, step // n_lights))
@@ -143,7 +167,9 @@ def lafortune_model(module, data, views, lights, n_lobes, factor=None):
     return model
 
 
-def bounds(luminance, lights, n_lobes):
+def bounds(
+    luminance: np.ndarray, lights: DirectionSet, n_lobes: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Start, lower and upper bounds of the parameters; luminance (n_views, n_lights, N) -> three (N, 1 + 5 k)."""
     peak = np.maximum(luminance.max((0, 1)), 1e-12)[:, None]
     limit, ones = exponent_limit(lights), np.ones_like(peak)
@@ -155,10 +181,20 @@ def bounds(luminance, lights, n_lobes):
         start += [*(c * ones for c in coefficients), np.log(exponent) * ones, 0.2 * peak]
         lower += [-ones, -ones, -ones, 0 * ones, 0 * ones]
         upper += [ones, ones, ones, np.log(limit) * ones, PEAK_BOUND * peak]
-    return tuple(np.concatenate(columns, 1).astype(np.float32) for columns in (start, lower, upper))
+    first, low, high = (np.concatenate(c, 1).astype(np.float32) for c in (start, lower, upper))
+    return first, low, high
 
 
-def fit_lafortune(luminance, views, lights, n_lobes, *, start=None, factor=None, iterations=100):
+def fit_lafortune(
+    luminance: np.ndarray,
+    views: DirectionSet,
+    lights: DirectionSet,
+    n_lobes: int,
+    *,
+    start: np.ndarray | None = None,
+    factor: np.ndarray | None = None,
+    iterations: int = 100,
+) -> BatchFit:
     """Lobes of N texels.
 
     Parameters
@@ -187,7 +223,7 @@ def fit_lafortune(luminance, views, lights, n_lobes, *, start=None, factor=None,
     return fit_batch(model, start, lower, upper, n_samples, iterations=iterations, ftol=1e-5)
 
 
-def lobe_maps(parameters):
+def lobe_maps(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Maps of fitted parameters (N, 1 + 5 k): lobes (N, 4 k), peaks (N, k), ρ_d (N,).
 
     Coefficients are scaled to a largest magnitude of 1 and the peak makes up for it: what is stored is unique, and as
@@ -202,7 +238,15 @@ def lobe_maps(parameters):
     return lobes.reshape(len(parameters), -1), peaks, parameters[:, 0]
 
 
-def fit(btf, *, seed=0, progress=None, lobes=4, storage="half", filter_type="bilinear"):
+def fit(
+    btf: SampledBTF,
+    *,
+    seed: int = 0,
+    progress: Progress | None = None,
+    lobes: int = 4,
+    storage: str = "half",
+    filter_type: str = "bilinear",
+) -> Representation:
     """Fit Lafortune lobes to each texel of ``btf`` by batched Levenberg–Marquardt.
 
     Parameters
@@ -235,7 +279,7 @@ def fit(btf, *, seed=0, progress=None, lobes=4, storage="half", filter_type="bil
     """
     n_lobes = positive_integer("lobes", lobes)
 
-    def fit_block(luminance):
+    def fit_block(luminance: np.ndarray) -> tuple[BatchFit, dict[str, np.ndarray]]:
         result = fit_lafortune(luminance, btf.views, btf.lights, n_lobes)
         return result, {}
 
@@ -246,7 +290,15 @@ def fit(btf, *, seed=0, progress=None, lobes=4, storage="half", filter_type="bil
     return result
 
 
-def fit_texels(method, btf, fit_block, parameters, progress, storage, filter_type):
+def fit_texels(
+    method: str,
+    btf: SampledBTF,
+    fit_block: Callable[[np.ndarray], tuple[BatchFit, dict[str, np.ndarray]]],
+    parameters: Facts,
+    progress: Progress | None,
+    storage: str,
+    filter_type: str,
+) -> tuple[dict[str, np.ndarray], Facts]:
     """Maps and meta of a fit of one Lafortune model a texel.
 
     Parameters

@@ -7,12 +7,21 @@ shows of itself to a view (self-occlusion); Meseth, Müller, Klein 2004, Table 1
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from btfref.representations.analytic import lafortune, light_functions
 from btfref.representations.lookup import positive_integer
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from btfref.numerics.solvers.levenberg import BatchFit
+    from btfref.representations.analytic.light_functions import HeldStencils
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.types import Progress
+
 
 #: "paper": Table 1's four lobes, in floats.
 PRESETS = {"paper": {"lobes": 4, "storage": "float"}}
@@ -27,14 +36,16 @@ class Representation(light_functions.AnalyticMaps):
     #: Maps by view; see :mod:`btfref.representations.file.resident`.
     DIRECTION_AXES: ClassVar = {"view": {"factor": 2}}
 
-    def evaluate(self, uv, w_light, w_view, *, lod=0.0):
+    def evaluate(
+        self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
+    ) -> np.ndarray:
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored. Never negative.
 
         The factor is interpolated over views as tables are; the lobes are evaluated at the view itself.
         """
         maps = lafortune.flat_maps(self.maps)
 
-        def kernel(s):
+        def kernel(s: HeldStencils) -> np.ndarray:
             factor = np.einsum(
                 "ntv,nv->nt", maps["factor"][s.texel[:, :, None], s.view[:, None, :]], s.view_weight
             )
@@ -43,13 +54,22 @@ class Representation(light_functions.AnalyticMaps):
 
         return light_functions.evaluate_analytic(self, kernel, uv, w_light, w_view)
 
-    def luminance_tables(self, texels, views):
+    def luminance_tables(self, texels: np.ndarray, views: np.ndarray) -> np.ndarray:
         """Model of luminance at measured views and all measured lights, shape (n, n_views, n_lights)."""
         factor = self.maps["factor"].reshape(-1, self.maps["factor"].shape[-1])[texels[:, None], views]
         return factor[..., None].astype(np.float32) * lafortune.luminance_tables(self.maps, texels, views)
 
 
-def fit(btf, *, seed=0, progress=None, lobes=4, rounds=1, storage="half", filter_type="bilinear"):
+def fit(
+    btf: SampledBTF,
+    *,
+    seed: int = 0,
+    progress: Progress | None = None,
+    lobes: int = 4,
+    rounds: int = 1,
+    storage: str = "half",
+    filter_type: str = "bilinear",
+) -> Representation:
     """Fit lobes, then the factor in closed form, then lobes with that factor, and so on.
 
     Parameters
@@ -82,7 +102,7 @@ def fit(btf, *, seed=0, progress=None, lobes=4, rounds=1, storage="half", filter
     """
     n_lobes, rounds = positive_integer("lobes", lobes), positive_integer("rounds", rounds)
 
-    def fit_block(luminance):
+    def fit_block(luminance: np.ndarray) -> tuple[BatchFit, dict[str, np.ndarray]]:
         result = lafortune.fit_lafortune(luminance, btf.views, btf.lights, n_lobes)
         factor = view_factor(luminance, result.parameters, btf)
         for _ in range(rounds):
@@ -101,7 +121,7 @@ def fit(btf, *, seed=0, progress=None, lobes=4, rounds=1, storage="half", filter
     return result
 
 
-def view_factor(luminance, parameters, btf):
+def view_factor(luminance: np.ndarray, parameters: np.ndarray, btf: SampledBTF) -> np.ndarray:
     """Least-squares factor of each view and texel, ``Σ_l B M / Σ_l M²`` in [0, 8]; 1 where the model is 0."""
     lobes, peaks, diffuse = lafortune.lobe_maps(parameters)
     colour = np.pad(diffuse[:, None], ((0, 0), (3, 0)))

@@ -8,7 +8,9 @@ the convention for lights beyond the last ring, so that nothing is extrapolated 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +20,16 @@ from btfref.numerics.sphere import interpolation
 from btfref.precision import real
 from btfref.representations.guide import feature_views, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from numpy.typing import ArrayLike
+
+    from btfref.representations.protocol import Representation
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.types import Progress
+
 
 #: Texels fitted at a time: bounds the memory of luminance tables and of normal equations.
 BLOCK = 4096
@@ -38,7 +50,13 @@ class HeldStencils:
     w_view: np.ndarray
 
 
-def evaluate_analytic(representation, kernel, uv, w_light, w_view):
+def evaluate_analytic(
+    representation: Representation,
+    kernel: Callable[[HeldStencils], np.ndarray],
+    uv: ArrayLike,
+    w_light: ArrayLike,
+    w_view: ArrayLike,
+) -> np.ndarray:
     """Evaluate a method whose maps are functions of the light.
 
     Parameters
@@ -56,7 +74,7 @@ def evaluate_analytic(representation, kernel, uv, w_light, w_view):
     meta = representation.meta
     views = interpolation.from_arrays(representation.arrays(), "view")
 
-    def lookup(uv, w_light, w_view):
+    def lookup(uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray) -> np.ndarray:
         texel, texel_weight = conventions.texel_stencil(uv, meta["texels"], meta["filter_type"])
         view, view_weight = views.stencil(w_view)
         light, fade = held(w_light, meta["constants"]["light_edge"])
@@ -66,7 +84,7 @@ def evaluate_analytic(representation, kernel, uv, w_light, w_view):
     return evaluate_points(lookup, uv, w_light, w_view)
 
 
-def held(w, edge):
+def held(w: ArrayLike, edge: float) -> tuple[np.ndarray, np.ndarray]:
     """Directions raised to the outermost measured cosine, and what lights below it fade by.
 
     Parameters
@@ -92,13 +110,15 @@ def held(w, edge):
     return raised, np.where(below, z / max(edge, 1e-30), 1)
 
 
-def edge_constants(btf):
+def edge_constants(btf: SampledBTF) -> dict[str, float]:
     """The smallest measured cosines; 0, which holds nothing, where they reach the horizon."""
     edges = {"light_edge": btf.lights.vectors[:, 2].min(), "view_edge": btf.views.vectors[:, 2].min()}
     return {name: float(np.float32(edge)) if edge > 1e-6 else 0.0 for name, edge in edges.items()}
 
 
-def luminance_blocks(btf, progress=None, label="fit"):
+def luminance_blocks(
+    btf: SampledBTF, progress: Progress | None = None, label: str = "fit"
+) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
     """Luminance and chroma of the texels, some at a time.
 
     Parameters
@@ -138,7 +158,7 @@ def luminance_blocks(btf, progress=None, label="fit"):
             progress(part.stop, rows * columns, label)
 
 
-def mean_absolute_error(representation, btf):
+def mean_absolute_error(representation: AnalyticMaps, btf: SampledBTF) -> np.ndarray:
     """ε of each texel: mean of |B − model| in luminance over all measured pairs; the paper's eq. 2.
 
     Returns
@@ -156,7 +176,7 @@ def mean_absolute_error(representation, btf):
     return result
 
 
-def fit_report(representation, btf):
+def fit_report(representation: AnalyticMaps, btf: SampledBTF) -> dict[str, float]:
     """JSON-able average, least and largest ε over texels, as Table 1 of the paper has them."""
     error = mean_absolute_error(representation, btf)
     return {"average": float(error.mean()), "minimum": float(error.min()), "maximum": float(error.max())}
@@ -166,7 +186,7 @@ def fit_report(representation, btf):
 PUBLISHED_BYTES = 365e6 / (256 * 256 * 81)
 
 
-def memory_report(maps, texels, n_views=None):
+def memory_report(maps: dict[str, np.ndarray], texels: int, n_views: int | None = None) -> dict[str, int]:
     """JSON-able bytes of a method's maps by the type of their numbers.
 
     Parameters
@@ -189,10 +209,20 @@ def memory_report(maps, texels, n_views=None):
     return result
 
 
-class AnalyticMaps(StoredMaps):
-    """Maps of a method that has ``luminance_tables(texels, views) -> (n, n_views, n_lights)``."""
+class AnalyticMaps(StoredMaps, ABC):
+    """Maps of a method whose model of luminance is known at measured directions."""
 
-    def sampling_tables(self):
+    @abstractmethod
+    def luminance_tables(self, texels: np.ndarray, views: np.ndarray) -> np.ndarray:
+        """Model of luminance at measured views and all measured lights, shape (n, n_views, n_lights).
+
+        Parameters
+        ----------
+        texels, views : ndarray of int, shapes (n,), (n_views,)
+            Flat indices of texels, and indices of views.
+        """
+
+    def sampling_tables(self) -> tuple[np.ndarray, np.ndarray]:
         """Groups of texels alike, and means over a few members of each."""
         rows, columns = self.meta["texels"]
         n_views, n_lights = (len(self.maps[f"{kind}_directions"]) for kind in ("view", "light"))

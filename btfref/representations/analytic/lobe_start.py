@@ -7,7 +7,13 @@ the checker its starts end in minima whose mean cost is 14 % lower.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from btfref.numerics.sphere.directions import DirectionSet
+
 
 #: Exponents tried at a direction; those of a start only have to lie in the right valley.
 EXPONENTS = (1.5, 5.0, 16.0, 50.0)
@@ -22,7 +28,7 @@ BLOCK = 2048
 SMOOTHING = 8.0
 
 
-def exponent_limit(lights):
+def exponent_limit(lights: DirectionSet) -> float:
     """Largest exponent that the measured lights can tell from a spike.
 
     A lobe midway between two lights still has half of its peak at both. A sharper one could hide between samples with
@@ -42,7 +48,7 @@ def exponent_limit(lights):
     return float(max(np.log(0.5) / np.log(max(np.cos(spacing / 2), 1e-6)), 2.0))
 
 
-def lobe_starts(data, lights, n_lobes, *, high_pass=False):
+def lobe_starts(data: np.ndarray, lights: np.ndarray, n_lobes: int, *, high_pass: bool = False) -> np.ndarray:
     """First guess of lobes, one after the other from what the ones before leave.
 
     Parameters
@@ -92,7 +98,7 @@ def lobe_starts(data, lights, n_lobes, *, high_pass=False):
     return result
 
 
-def tilted_starts(data, lights, parameters):
+def tilted_starts(data: np.ndarray, lights: np.ndarray, parameters: np.ndarray) -> np.ndarray:
     """Another guess from lobes that were found: the highest one leans away from the normal, the rest start anew.
 
     A highlight at the outermost lights that is sharper than exponents may be is met best by the flank of a lobe whose
@@ -113,7 +119,7 @@ def tilted_starts(data, lights, parameters):
     s, t, log_exponent, peak = lobes[row, lobes[..., 3].argmax(1)].T
     brightest = lights[data.argmax(1)]
 
-    def values(s, t, lights):
+    def values(s: np.ndarray, t: np.ndarray, lights: np.ndarray) -> np.ndarray:
         cosine = (2 * (s * lights[..., 0] + t * lights[..., 1]) + 2 * lights[..., 2]) / (1 + s * s + t * t)
         return np.maximum(cosine - lights[..., 2], 1e-3) ** np.exp(log_exponent)
 

@@ -12,7 +12,7 @@ to a power.
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -27,6 +27,18 @@ from btfref.representations.analytic.lobe_start import (
     tilted_starts,
 )
 from btfref.representations.lookup import base_meta, direction_arrays, positive_integer, stored
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    from numpy.typing import ArrayLike
+
+    from btfref.numerics.solvers.levenberg import BatchFit, Model, Samples
+    from btfref.numerics.sphere.directions import DirectionSet
+    from btfref.representations.analytic.light_functions import HeldStencils
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.types import Facts, JitArray, Progress
+
 
 #: "paper": two lobes in floats.
 PRESETS = {"paper": {"lobes": 2, "storage": "float"}}
@@ -63,12 +75,14 @@ class Representation(light_functions.AnalyticMaps):
     DIRECTION_AXES: ClassVar = {"view": {"lobes": 2}}
     ROWS_BY: ClassVar = {"lobes": (2,)}
 
-    def evaluate(self, uv, w_light, w_view, *, lod=0.0):
+    def evaluate(
+        self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
+    ) -> np.ndarray:
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored. Never negative."""
         lobes = self._lobes()
         colour = real(self.maps["colour"].reshape(-1, 4))
 
-        def kernel(s):
+        def kernel(s: HeldStencils) -> np.ndarray:
             index = (s.texel[:, :, None], s.view[:, None, :])
             value = lobe_sum(real(lobes[index]), s.w_light[:, None, None, None])
             value = np.einsum("ntv,nt,nv->nt", value, s.texel_weight, s.view_weight)
@@ -78,12 +92,12 @@ class Representation(light_functions.AnalyticMaps):
 
         return light_functions.evaluate_analytic(self, kernel, uv, w_light, w_view)
 
-    def _lobes(self):
+    def _lobes(self) -> np.ndarray:
         """Lobes by flat texel and view, shape (n_texels, n_views, k, 4)."""
         lobes = self.maps["lobes"]
         return lobes.reshape(-1, lobes.shape[2], lobes.shape[3] // 4, 4)
 
-    def luminance_tables(self, texels, views):
+    def luminance_tables(self, texels: np.ndarray, views: np.ndarray) -> np.ndarray:
         """Model of luminance at measured views and all measured lights, shape (n, n_views, n_lights)."""
         lights = self.maps["light_directions"].astype(np.float32)
         s, t, exponent, peak = np.moveaxis(self._lobes()[texels[:, None], views].astype(np.float32), -1, 0)
@@ -96,19 +110,19 @@ class Representation(light_functions.AnalyticMaps):
         return result
 
 
-def parabolic_axis(s, t):
+def parabolic_axis(s: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Unit vectors of parabolic coordinates, on the whole sphere but for its lower pole; (...) -> (..., 3)."""
     r2 = s * s + t * t
     return np.stack([2 * s, 2 * t, 1 - r2], -1) / (1 + r2)[..., None]
 
 
-def lobe_sum(lobes, w_light):
+def lobe_sum(lobes: np.ndarray, w_light: np.ndarray) -> np.ndarray:
     """``Σ_j peak_j (axis_j · l)^{n_j}``; (..., k, 4), (..., 1, 3) -> (...)."""
     s, t, exponent, peak = np.moveaxis(lobes, -1, 0)
     return (peak * unit_lobe(parabolic_axis(s, t), w_light, exponent)).sum(-1)
 
 
-def lobe_model(module, data, lights, n_lobes):
+def lobe_model(module: ModuleType, data: np.ndarray, lights: np.ndarray, n_lobes: int) -> tuple[Model, int]:
     """Residuals and Jacobian of lobes for :func:`fit_batch`, and the number of its steps.
 
     Parameters
@@ -138,7 +152,7 @@ def lobe_model(module, data, lights, n_lobes):
     table = Float(np.ascontiguousarray(table.transpose(0, 2, 1)).ravel())
     steps = dr.opaque(module.UInt32, n_steps)
 
-    def model(p, fit):
+    def model(p: list[JitArray], fit: JitArray) -> tuple[Samples, list[JitArray]]:
         shapes, units = [], []
         for j in range(n_lobes):
             s, t, log_exponent, peak = p[4 * j : 4 * j + 4]
@@ -149,12 +163,14 @@ def lobe_model(module, data, lights, n_lobes):
             slope = 2 * scale * peak * exponent
             units += [slope, slope, peak * exponent * 0.6931471805599453, Float(1)]
 
-        def samples(step):
+        def samples(step: JitArray) -> list[tuple[JitArray, list[JitArray]]]:
             x, y, z = (dr.gather(module.Array4f, table, 3 * step + i) for i in range(3))
             wanted = dr.gather(module.Array4f, values, dr.fma(fit, steps, step))
             return [sample((x[i], y[i], z[i]), wanted[i]) for i in range(4)]
 
-        def sample(light, wanted):
+        def sample(
+            light: tuple[JitArray, JitArray, JitArray], wanted: JitArray
+        ) -> tuple[JitArray, list[JitArray]]:
             r, row = -wanted, []
             for s, t, axis, exponent, peak in shapes:
                 cosine = dr.fma(axis[0], light[0], dr.fma(axis[1], light[1], axis[2] * light[2]))
@@ -175,15 +191,15 @@ def lobe_model(module, data, lights, n_lobes):
 
 
 def fit(
-    btf,
+    btf: SampledBTF,
     *,
-    seed=0,
-    progress=None,
-    lobes=2,
-    diffuse_quantile=DIFFUSE_QUANTILE,
-    storage="half",
-    filter_type="bilinear",
-):
+    seed: int = 0,
+    progress: Progress | None = None,
+    lobes: int = 2,
+    diffuse_quantile: float = DIFFUSE_QUANTILE,
+    storage: str = "half",
+    filter_type: str = "bilinear",
+) -> Representation:
     """Fit lobes to ``btf`` by batched Levenberg–Marquardt.
 
     Fits that do not converge, and those that leave most, are repeated from a second start; the better result is kept.
@@ -225,7 +241,7 @@ def fit(
             "a parameter is out of range", field="diffuse_quantile", got=diffuse_quantile, expected="0 to 1"
         )
     n_views, _, rows, columns, _ = btf.values.shape
-    maps = {
+    maps: dict[str, np.ndarray] = {
         "lobes": np.zeros((rows * columns, n_views, 4 * n_lobes), np.float32),
         "colour": np.zeros((rows * columns, 4), np.float32),
     }
@@ -234,13 +250,13 @@ def fit(
         diffuse = diffuse_albedo(luminance, btf.lights.vectors, diffuse_quantile)
         data = luminance - (diffuse * btf.lights.vectors[:, 2, None]).astype(np.float32)
         n = data.shape[2]
-        result = fit_lobes(data.swapaxes(1, 2).reshape(n_views * n, -1), btf.lights, n_lobes)
-        parameters = result.parameters.reshape(n_views, n, 4 * n_lobes)
-        parameters[..., 2::4] = np.exp(parameters[..., 2::4])
-        maps["lobes"][part] = parameters.swapaxes(0, 1)
+        found = fit_lobes(data.swapaxes(1, 2).reshape(n_views * n, -1), btf.lights, n_lobes)
+        numbers = found.parameters.reshape(n_views, n, 4 * n_lobes)
+        numbers[..., 2::4] = np.exp(numbers[..., 2::4])
+        maps["lobes"][part] = numbers.swapaxes(0, 1)
         maps["colour"][part] = np.concatenate([chroma, diffuse[:, None]], 1)
-        summaries.append(result.summary)
-        view, texel = np.divmod(np.flatnonzero(~result.converged), n)
+        summaries.append(found.summary)
+        view, texel = np.divmod(np.flatnonzero(~found.converged), n)
         failed += np.stack([texel + part.start, view], 1).tolist()
     shapes = {"lobes": (rows, columns, n_views, -1), "colour": (rows, columns, 4)}
     maps = {name: stored(name, array.reshape(shapes[name]), storage) for name, array in maps.items()}
@@ -256,7 +272,7 @@ def fit(
     return result
 
 
-def merged(summaries):
+def merged(summaries: list[Facts]) -> Facts:
     """One summary of several batches."""
     fits = sum(s["fits"] for s in summaries)
     result = {key: sum(s[key] for s in summaries) for key in ("fits", "converged", "not_converged")}
@@ -265,7 +281,7 @@ def merged(summaries):
     return result
 
 
-def diffuse_albedo(luminance, lights, quantile):
+def diffuse_albedo(luminance: np.ndarray, lights: np.ndarray, quantile: float) -> np.ndarray:
     """ρ_d of each texel: a quantile of luminance / l_z; (n_views, n_lights, n) -> (n,)."""
     # Grazing lights would amplify noise: 0.2 leaves out what is below 78 degrees.
     high = lights[:, 2] > 0.2
@@ -277,16 +293,25 @@ def diffuse_albedo(luminance, lights, quantile):
     )
 
 
-def lobe_bounds(data, lights, n_lobes):
+def lobe_bounds(data: np.ndarray, lights: DirectionSet, n_lobes: int) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of the parameters of N fits, two arrays of shape (N, 4 n_lobes)."""
     peak = PEAK_BOUND * np.maximum(data.max(1), 0)[:, None]
     ones, limit = np.ones_like(peak), np.log(exponent_limit(lights))
     lower = [-AXIS_BOUND * ones, -AXIS_BOUND * ones, np.log(LEAST_EXPONENT) * ones, 0 * ones]
     upper = [AXIS_BOUND * ones, AXIS_BOUND * ones, limit * ones, peak]
-    return tuple(np.tile(np.concatenate(columns, 1), n_lobes) for columns in (lower, upper))
+    low, high = (np.tile(np.concatenate(columns, 1), n_lobes) for columns in (lower, upper))
+    return low, high
 
 
-def fit_lobes(data, lights, n_lobes, *, iterations=100, high_pass=False, restart=True):
+def fit_lobes(
+    data: np.ndarray,
+    lights: DirectionSet,
+    n_lobes: int,
+    *,
+    iterations: int = 100,
+    high_pass: bool = False,
+    restart: bool = True,
+) -> BatchFit:
     """Lobes of N reflectance fields.
 
     Parameters
@@ -310,7 +335,7 @@ def fit_lobes(data, lights, n_lobes, *, iterations=100, high_pass=False, restart
 
     module = backend()
 
-    def run(data, start, steps):
+    def run(data: np.ndarray, start: np.ndarray, steps: int) -> BatchFit:
         model, n_steps = lobe_model(module, data, lights.vectors, n_lobes)
         bounds = lobe_bounds(data, lights, n_lobes)
         return fit_batch(model, start, *bounds, n_steps, iterations=steps, ftol=FTOL)

@@ -11,13 +11,21 @@ l_z²``, so the functions are the same, but at grazing light, where they are sma
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from btfref.precision import real
 from btfref.representations.analytic import light_functions
 from btfref.representations.lookup import base_meta, direction_arrays, stored
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from btfref.representations.analytic.light_functions import HeldStencils
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.types import Facts, Progress
+
 
 #: "paper": all 81 views in floats.
 PRESETS = {"paper": {"storage": "float"}}
@@ -27,7 +35,7 @@ PRESETS = {"paper": {"storage": "float"}}
 CUTOFF = 1e-5
 
 
-def terms(w_light):
+def terms(w_light: np.ndarray) -> np.ndarray:
     """The six terms of the polynomial, shape (..., 3) -> (..., 6)."""
     x, y, z = np.moveaxis(w_light, -1, 0)
     return np.stack([x * x, y * y, x * y, x, y, z * z], -1)
@@ -40,7 +48,9 @@ class Representation(light_functions.AnalyticMaps):
     DIRECTION_AXES: ClassVar = {"view": {"polynomial": 2}}
     ROWS_BY: ClassVar = {"polynomial": (2,)}
 
-    def evaluate(self, uv, w_light, w_view, *, lod=0.0):
+    def evaluate(
+        self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
+    ) -> np.ndarray:
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored.
 
         May be negative where a polynomial undershoots.
@@ -49,7 +59,7 @@ class Representation(light_functions.AnalyticMaps):
         polynomial = polynomial.reshape(-1, *polynomial.shape[2:])
         chroma = real(self.maps["chroma"].reshape(-1, 3))
 
-        def kernel(s):
+        def kernel(s: HeldStencils) -> np.ndarray:
             coefficient = real(polynomial[s.texel[:, :, None], s.view[:, None, :]])
             value = np.einsum("ntvk,nk->ntv", coefficient, terms(s.w_light))
             value = np.einsum("ntv,nt,nv->nt", value, s.texel_weight, s.view_weight)
@@ -57,14 +67,14 @@ class Representation(light_functions.AnalyticMaps):
 
         return light_functions.evaluate_analytic(self, kernel, uv, w_light, w_view)
 
-    def luminance_tables(self, texels, views):
+    def luminance_tables(self, texels: np.ndarray, views: np.ndarray) -> np.ndarray:
         """Model of luminance at measured views and all measured lights, shape (n, n_views, n_lights)."""
         polynomial = self.maps["polynomial"]
         coefficient = polynomial.reshape(-1, *polynomial.shape[2:])[texels[:, None], views].astype(np.float32)
         return coefficient @ terms(self.maps["light_directions"].astype(np.float32)).T
 
 
-def light_operator(lights):
+def light_operator(lights: np.ndarray) -> tuple[np.ndarray, Facts]:
     """The pseudo-inverse of the terms at the measured lights.
 
     Parameters
@@ -87,7 +97,14 @@ def light_operator(lights):
     }
 
 
-def fit(btf, *, seed=0, progress=None, storage="half", filter_type="bilinear"):
+def fit(
+    btf: SampledBTF,
+    *,
+    seed: int = 0,
+    progress: Progress | None = None,
+    storage: str = "half",
+    filter_type: str = "bilinear",
+) -> Representation:
     """Least-squares polynomials of ``btf`` in closed form.
 
     Parameters

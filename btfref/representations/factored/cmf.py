@@ -9,6 +9,7 @@ measured parameterization; the leading terms of that residue are the factors of 
 from __future__ import annotations
 
 import itertools
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,6 +35,14 @@ from btfref.representations.factored.fit import (
 from btfref.representations.factored.storage import Storing, fitted
 from btfref.representations.lookup import positive_integer
 
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+    from btfref.representations.factored.fit import Step
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.types import Progress
+
+
 __all__ = ["PRESETS", "Representation", "fit"]
 
 #: "paper": factors as the chain leaves them, all in 8 bits, scales from the normalisation alone.
@@ -46,7 +55,7 @@ DIFFERENCE_STEP = 11.25
 N_PROBED_PARTS = 3
 
 
-def ring_set(step):
+def ring_set(step: float) -> DirectionSet:
     """Rings from the pole to the horizon, about ``step`` degrees apart and equally dense along each."""
     n = max(1, int(np.ceil(90 / step - 1e-9)))
     polar = np.arange(1, n + 1) * (90 / n)
@@ -70,7 +79,9 @@ class Resampling:
         With the difference factor.
     """
 
-    def __init__(self, views, lights, half_step, map_size, four):
+    def __init__(
+        self, views: DirectionSet, lights: DirectionSet, half_step: float, map_size: int, four: bool
+    ) -> None:
         self.half_set = ring_set(half_step)
         self.difference_set = ring_set(DIFFERENCE_STEP)
         h, d = half_difference(lights.vectors[None], views.vectors[:, None])
@@ -95,7 +106,7 @@ class Resampling:
             **{name: (getattr(maps, name) @ to).tocsr() for name, to in self.to_maps.items()}
         )
 
-    def _half_difference(self, views, lights):
+    def _half_difference(self, views: DirectionSet, lights: DirectionSet) -> tuple[csr_matrix, np.ndarray]:
         """Operator (view, light) -> (half, difference), and where both directions are above the horizon."""
         w_light, w_view = in_out(self.half_set.vectors[:, None], self.difference_set.vectors[None])
         known = (w_light[..., 2] >= -1e-9) & (w_view[..., 2] >= -1e-9)
@@ -109,7 +120,9 @@ class Resampling:
         )
         return operator, known.astype(np.float32)
 
-    def _parabolic(self, views, lights, map_size, four):
+    def _parabolic(
+        self, views: DirectionSet, lights: DirectionSet, map_size: int, four: bool
+    ) -> dict[str, csr_matrix]:
         """Operators from the factors' samples to the texels of their maps."""
         w = texel_directions(map_size).reshape(-1, 3)
         # Just above the horizon, where the weights and the fall to the horizon still have a quotient.
@@ -127,7 +140,7 @@ class Resampling:
             result["d"] = sparse_operator(*self.difference_set.stencil(w), len(self.difference_set))
         return result
 
-    def errors(self, data, factors):
+    def errors(self, data: np.ndarray, factors: dict[str, np.ndarray]) -> dict[str, float]:
         """Relative RMS errors of going to another parameterization and back, for tables and their factors."""
         there = (self.to_half_difference @ data.reshape(-1, data.shape[-1])).reshape(*self.known.shape, -1)
         (h, h_weight), (d, d_weight) = self.half_stencil, self.difference_stencil
@@ -138,7 +151,7 @@ class Resampling:
                     h[:, i], d[:, j]
                 ]
 
-        def relative(test, reference):
+        def relative(test: np.ndarray, reference: np.ndarray) -> float:
             energy = float((reference.astype(float) ** 2).sum())
             return (
                 float(np.sqrt(((test - reference).astype(float) ** 2).sum() / energy)) if energy > 0 else 0.0
@@ -152,7 +165,7 @@ class Resampling:
         return result
 
 
-def chain(data, resampling, terms, floor):
+def chain(data: np.ndarray, resampling: Resampling, terms: int, floor: float) -> dict[str, np.ndarray]:
     """The chained factorization of tables.
 
     Parameters
@@ -183,24 +196,24 @@ def chain(data, resampling, terms, floor):
 
 
 def fit(
-    btf,
+    btf: SampledBTF,
     *,
-    seed=0,
-    progress=None,
-    difference=False,
-    terms=1,
-    sweeps=8,
-    exponent=0.75,
-    floor=1e-3,
-    half_step=5.0,
-    map_size=32,
-    clusters=256,
-    storage="half",
-    scale_storage=None,
-    code="fourth",
-    rescale=True,
-    filter_type="bilinear",
-):
+    seed: int = 0,
+    progress: Progress | None = None,
+    difference: bool = False,
+    terms: int = 1,
+    sweeps: int = 8,
+    exponent: float = 0.75,
+    floor: float = 1e-3,
+    half_step: float = 5.0,
+    map_size: int = 32,
+    clusters: int | None = 256,
+    storage: str = "half",
+    scale_storage: str | None = None,
+    code: str = "fourth",
+    rescale: bool = True,
+    filter_type: str = "bilinear",
+) -> Representation:
     """Chained matrix factorization of ``btf``, clustered.
 
     Parameters
@@ -229,7 +242,7 @@ def fit(
     """
     storing = Storing(clusters, storage, scale_storage, code, rescale, filter_type)
 
-    def factors(step):
+    def factors(step: Step) -> Factors:
         return factorize(
             btf,
             step=step,
@@ -246,17 +259,17 @@ def fit(
 
 
 def factorize(
-    btf,
+    btf: SampledBTF,
     *,
-    step=lambda label: None,
-    difference=False,
-    terms=1,
-    sweeps=8,
-    exponent=0.75,
-    floor=1e-3,
-    half_step=5.0,
-    map_size=32,
-):
+    step: Step = lambda label: None,
+    difference: bool = False,
+    terms: int = 1,
+    sweeps: int = 8,
+    exponent: float = 0.75,
+    floor: float = 1e-3,
+    half_step: float = 5.0,
+    map_size: int = 32,
+) -> Factors:
     """Factors of every texel of ``btf``, not yet clustered.
 
     Parameters
@@ -302,7 +315,7 @@ def factorize(
     probed = set(np.linspace(0, n_parts - 1, min(N_PROBED_PARTS, n_parts)).round().astype(int).tolist())
     probes, done = [], itertools.count()
 
-    def one_part(data):
+    def one_part(data: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         factors = chain(data, resampling, terms, floor)
         models = {"factors": resampling.measured.product(factors)}
         if next(done) in probed:

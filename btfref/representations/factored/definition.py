@@ -10,6 +10,8 @@ peak of 1; the scale is fitted again to the stored maps.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from btfref import conventions
@@ -19,6 +21,13 @@ from btfref.numerics.sphere.parabolic import bilinear_stencil
 from btfref.precision import precision, real
 from btfref.representations.guide import N_GROUPS, feature_views, group_means, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, DTypeLike
+
+    from btfref.numerics.solvers.factoring import FactorOperators
+    from btfref.types import Facts, JitArray
+
 
 #: Factors in the order of the index map's channels; with one term each and no D these are the paper's r, g and b.
 FACTORS = ("p", "q", "r", "d")
@@ -37,7 +46,9 @@ class Representation(StoredMaps):
     are 1 or 4: what the numbers in the maps, and in the map of scales, are raised to.
     """
 
-    def evaluate(self, uv, w_light, w_view, *, lod=0.0):
+    def evaluate(
+        self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
+    ) -> np.ndarray:
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored.
 
         Never negative.
@@ -49,7 +60,7 @@ class Representation(StoredMaps):
         tables = {name: self.maps[f"factor_{name}"].reshape(-1, n * n, 3) for name in self.names}
         slots, power = index_slots(meta["constants"]), meta["constants"]["map_power"]
 
-        def lookup(uv, w_light, w_view):
+        def lookup(uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray) -> np.ndarray:
             texel, weight = conventions.texel_stencil(uv, meta["texels"], meta["filter_type"])
             h, d = half_difference(w_light, w_view)
             stencils = {
@@ -58,7 +69,7 @@ class Representation(StoredMaps):
                 if name in tables
             }
 
-            def read(name, k):
+            def read(name: str, k: int) -> np.ndarray:
                 texels, share = stencils[name]
                 prototype = index[texel, slots[name].start + k]
                 values = decoded(tables[name][prototype[:, :, None], texels[:, None, :]], power)
@@ -77,11 +88,11 @@ class Representation(StoredMaps):
         return evaluate_points(lookup, uv, w_light, w_view)
 
     @property
-    def names(self):
+    def names(self) -> tuple[str, ...]:
         """The factors that there are, in order."""
         return tuple(name for name in FACTORS if f"factor_{name}" in self.maps)
 
-    def _scales(self):
+    def _scales(self) -> tuple[np.ndarray, np.ndarray]:
         """Scales of the terms of P · R and of Q · D, shapes (texel, term, 3), as the definition computes."""
         constants = self.meta["constants"]
         scale = decoded(self.maps["scale_map"], constants["scale_power"]) * real(self.maps["scale_peak"])
@@ -91,12 +102,12 @@ class Representation(StoredMaps):
             return scale, half.reshape(-1, *half.shape[2:])
         return scale, np.ones((len(scale), 1, 3), scale.dtype)
 
-    def factors(self, texels):
+    def factors(self, texels: np.ndarray) -> dict[str, np.ndarray]:
         """Factors of some texels with their scales, as `FactorOperators` reads them.
 
         Parameters
         ----------
-        texels : array_like of int, shape (k,)
+        texels : ndarray of int, shape (k,)
             Flat indices.
 
         Returns
@@ -116,12 +127,12 @@ class Representation(StoredMaps):
             result[name] = batch_last(maps)
         return result
 
-    def tables(self, texels, operators):
+    def tables(self, texels: np.ndarray, operators: FactorOperators) -> np.ndarray:
         """B of some texels at all measured pairs, shape (view, light, k, 3) float32."""
         product = operators.product(self.factors(texels))
         return product.reshape(*operators.shape, -1, 3)
 
-    def sampling_tables(self):
+    def sampling_tables(self) -> tuple[np.ndarray, np.ndarray]:
         """Groups of texels alike, and the means of some of their members."""
         n_texels = int(np.prod(self.meta["texels"]))
         views = self.maps["view_directions"].astype(float)
@@ -152,7 +163,7 @@ class Representation(StoredMaps):
         return labels.reshape(self.meta["texels"]), group_means(labels[members], tables)
 
 
-def index_slots(constants):
+def index_slots(constants: Facts) -> dict[str, slice]:
     """Channels of the index map that hold each factor's terms, as slices."""
     terms, half_terms = constants["n_terms"], constants["n_half_terms"]
     result, start = {}, 0
@@ -162,14 +173,14 @@ def index_slots(constants):
     return result
 
 
-def light_fade(w_light, cos_last):
+def light_fade(w_light: ArrayLike, cos_last: float) -> np.ndarray:
     """``min(1, cos θ / cos θ_last)``: P holds its last ring, B falls to zero at the horizon."""
     if cos_last <= 1e-6:
         return np.ones(np.shape(w_light)[:-1], precision())
     return np.minimum(real(w_light)[..., 2] / cos_last, 1)
 
 
-def decoded(array, power, dtype=None):
+def decoded(array: np.ndarray, power: int, dtype: DTypeLike | None = None) -> np.ndarray:
     """Values of a stored map: what is stored (of uint8 a 255th) to the ``power`` of 1 or 4."""
     values = array.astype(precision() if dtype is None else dtype)
     if array.dtype == np.uint8:
@@ -177,7 +188,7 @@ def decoded(array, power, dtype=None):
     return raised(values, power)
 
 
-def raised(values, power):
+def raised(values: JitArray, power: int) -> JitArray:
     """``values`` to the power of 1 or 4."""
     if power == 1:
         return values
@@ -185,7 +196,7 @@ def raised(values, power):
     return squares * squares
 
 
-def batch_last(maps):
+def batch_last(maps: np.ndarray) -> np.ndarray:
     """Maps as factors: (texel, term, n, n, 3) -> (term, n², texel * 3)."""
     k, terms, n = maps.shape[:3]
     return np.ascontiguousarray(np.moveaxis(maps.reshape(k, terms, n * n, 3), 0, 2)).reshape(
@@ -193,7 +204,7 @@ def batch_last(maps):
     )
 
 
-def texel_parts(n_texels, texels=None, size=32):
+def texel_parts(n_texels: int, texels: np.ndarray | None = None, size: int = 32) -> list[np.ndarray]:
     """Index arrays of at most ``size`` texels: small enough for their tables to stay in cache."""
     texels = np.arange(n_texels) if texels is None else texels
     return [texels[start : start + size] for start in range(0, n_texels, size)]

@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.representations.factored.definition import texel_parts
 from btfref.representations.lookup import positive_integer
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.types import Facts, Progress
+
+
+#: Called with what begins.
+Step = Callable[[str], object]
+
+#: Tables of some texels → their maps, and approximations of these tables by name; see :func:`factorized`.
+FactorizePart = Callable[[np.ndarray], tuple[dict[str, np.ndarray], dict[str, np.ndarray]]]
 
 
 @dataclass(frozen=True)
@@ -29,26 +44,26 @@ class Factors:
     """
 
     method: str
-    maps: dict
+    maps: dict[str, np.ndarray]
     exponent: float
-    parameters: dict
-    facts: dict
+    parameters: Facts
+    facts: Facts
 
 
 class Steps:
     """Counts the steps of a fit for ``progress(done, total, label)``, which may be None."""
 
-    def __init__(self, progress, total):
+    def __init__(self, progress: Progress | None, total: int) -> None:
         self._progress, self._total, self._done = progress, total, 0
 
-    def __call__(self, label):
+    def __call__(self, label: str) -> None:
         """One more step begins."""
         self._done += 1
         if self._progress is not None:
             self._progress(self._done, self._total, label)
 
 
-def checked_ranges(**ranges):
+def checked_ranges(**ranges: tuple[float, float, float]) -> None:
     """Raise InputError for a value outside its range; ``name=(value, low, high)``, both ends included."""
     for name, (value, low, high) in ranges.items():
         if not low <= value <= high:
@@ -57,14 +72,17 @@ def checked_ranges(**ranges):
             )
 
 
-def checked_map_size(map_size):
+def checked_map_size(map_size: object) -> int:
     """``map_size`` as an int; one texel is no map."""
-    if positive_integer("map_size", map_size) < 2:
+    size = positive_integer("map_size", map_size)
+    if size < 2:
         raise InputError("a parameter is out of range", field="map_size", got=map_size, expected="at least 2")
-    return int(map_size)
+    return size
 
 
-def factorized(btf, counts, map_size, step, factorize):
+def factorized(
+    btf: SampledBTF, counts: Mapping[str, int], map_size: int, step: Step, factorize: FactorizePart
+) -> tuple[dict[str, np.ndarray], Facts]:
     """Factorize all texels, part by part.
 
     Parameters
@@ -89,7 +107,8 @@ def factorized(btf, counts, map_size, step, factorize):
     maps = {
         name: np.zeros((n_texels, terms, map_size, map_size, 3), np.float32) for name, terms in counts.items()
     }
-    energy, squared = 0.0, {}
+    energy = 0.0
+    squared: dict[str, float] = {}
     for texels in texel_parts(n_texels):
         step("factorization")
         data, mean = unit_tables(btf, texels)
@@ -105,7 +124,7 @@ def factorized(btf, counts, map_size, step, factorize):
     return maps, {name: value / energy if energy > 0 else 0.0 for name, value in squared.items()}
 
 
-def unit_tables(btf, texels):
+def unit_tables(btf: SampledBTF, texels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Tables of some texels with a mean of 1, and their means.
 
     Parameters

@@ -9,6 +9,8 @@ channels.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from btfref.numerics.solvers.factoring import map_operators
@@ -22,6 +24,15 @@ from btfref.representations.factored.fit import (
     unit_tables,
 )
 from btfref.representations.factored.storage import Storing, fitted
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+    from btfref.numerics.sphere.directions import DirectionSet
+    from btfref.representations.factored.fit import Step
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.types import Facts, Progress
+
 
 __all__ = ["PRESETS", "Representation", "fit"]
 
@@ -65,7 +76,7 @@ class LogSystem:
     map_size : int
     """
 
-    def __init__(self, views, lights, map_size):
+    def __init__(self, views: DirectionSet, lights: DirectionSet, map_size: int) -> None:
         from scipy import sparse
 
         self.map_size = map_size
@@ -79,7 +90,7 @@ class LogSystem:
         self.rows = sparse.hstack([block.tocsc()[:, self.used] for block in blocks]).tocsr().astype(float)
         self.laplacian = sparse.block_diag([self._laplacian()] * 3).tocsr()
 
-    def _laplacian(self):
+    def _laplacian(self) -> csr_matrix:
         """Graph Laplacian of the texels in use: second differences inside, flat across the border."""
         from scipy import sparse
 
@@ -99,7 +110,7 @@ class LogSystem:
         links = (links + links.T).tocsr()
         return sparse.diags(np.asarray(links.sum(1)).ravel()) - links
 
-    def factorize(self, smoothness, rows=None):
+    def factorize(self, smoothness: float, rows: np.ndarray | None = None) -> tuple[np.ndarray, bool]:
         """Cholesky factor of the normal equations; ``rows`` selects samples."""
         from scipy.linalg import cho_factor
 
@@ -108,14 +119,18 @@ class LogSystem:
         normal[np.diag_indices_from(normal)] += RIDGE
         return cho_factor(normal, lower=True, overwrite_a=True, check_finite=False)
 
-    def solve(self, factor, logarithms, rows=None):
+    def solve(
+        self, factor: tuple[np.ndarray, bool], logarithms: np.ndarray, rows: np.ndarray | None = None
+    ) -> np.ndarray:
         """Logarithms of the factors in use, shape (3 * used, m), for samples (pairs, m)."""
         from scipy.linalg import cho_solve
 
         matrix = self.rows if rows is None else self.rows[rows]
         return cho_solve(factor, matrix.T @ logarithms, check_finite=False)
 
-    def choose_smoothness(self, logarithms, rng):
+    def choose_smoothness(
+        self, logarithms: np.ndarray, rng: np.random.Generator
+    ) -> tuple[float, list[float]]:
         """The candidate that predicts held-out samples best, by squared error of the logarithm."""
         held = rng.permutation(len(logarithms)) < HELD_OUT * len(logarithms)
         errors = []
@@ -124,7 +139,7 @@ class LogSystem:
             errors.append(float(((self.rows[held] @ solution - logarithms[held]) ** 2).mean()))
         return SMOOTHNESS[int(np.argmin(errors))], errors
 
-    def maps(self, solution):
+    def maps(self, solution: np.ndarray) -> dict[str, np.ndarray]:
         """Maps of the three factors: dict of (n², m), the unused corners black."""
         result = {}
         for name, block in zip("pqr", np.split(solution, 3), strict=True):
@@ -135,27 +150,27 @@ class LogSystem:
         return result
 
 
-def logarithms(tables, floor):
+def logarithms(tables: np.ndarray, floor: float) -> np.ndarray:
     """Logarithms of tables of mean 1, values below ``floor`` counted as ``floor``; (view, light, m) -> (pairs, m)."""
     return np.log(np.maximum(tables, floor)).reshape(-1, tables.shape[-1]).astype(float)
 
 
 def fit(
-    btf,
+    btf: SampledBTF,
     *,
-    seed=0,
-    progress=None,
-    smoothness=None,
-    floor=1e-2,
-    bounded=True,
-    map_size=32,
-    clusters=256,
-    storage="half",
-    scale_storage=None,
-    code="fourth",
-    rescale=True,
-    filter_type="bilinear",
-):
+    seed: int = 0,
+    progress: Progress | None = None,
+    smoothness: float | None = None,
+    floor: float = 1e-2,
+    bounded: bool = True,
+    map_size: int = 32,
+    clusters: int | None = 256,
+    storage: str = "half",
+    scale_storage: str | None = None,
+    code: str = "fourth",
+    rescale: bool = True,
+    filter_type: str = "bilinear",
+) -> Representation:
     """Homomorphic factorization of ``btf``, clustered.
 
     Parameters
@@ -184,7 +199,7 @@ def fit(
     """
     storing = Storing(clusters, storage, scale_storage, code, rescale, filter_type)
 
-    def factors(step):
+    def factors(step: Step) -> Factors:
         return factorize(
             btf, seed=seed, step=step, smoothness=smoothness, floor=floor, bounded=bounded, map_size=map_size
         )
@@ -193,8 +208,15 @@ def fit(
 
 
 def factorize(
-    btf, *, seed=0, step=lambda label: None, smoothness=None, floor=1e-2, bounded=True, map_size=32
-):
+    btf: SampledBTF,
+    *,
+    seed: int = 0,
+    step: Step = lambda label: None,
+    smoothness: float | None = None,
+    floor: float = 1e-2,
+    bounded: bool = True,
+    map_size: int = 32,
+) -> Factors:
     """Factors of every texel of ``btf``, not yet clustered.
 
     Parameters
@@ -227,7 +249,8 @@ def factorize(
     if smoothness is not None:
         checked_ranges(smoothness=(smoothness, np.finfo(float).tiny, np.finfo(float).max))
     step("smoothness")
-    system, facts = LogSystem(btf.views, btf.lights, map_size), {}
+    system = LogSystem(btf.views, btf.lights, map_size)
+    facts: Facts = {}
     if smoothness is None:
         n_texels = int(np.prod(btf.texels))
         some = np.unique(np.linspace(0, n_texels - 1, min(N_JUDGED, n_texels)).round().astype(int))
@@ -244,7 +267,7 @@ def factorize(
     }
     log_errors = []
 
-    def one_part(data):
+    def one_part(data: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         log_data = logarithms(data, floor)
         solution = system.solve(factor, log_data)
         log_errors.append(((system.rows @ solution - log_data) ** 2).mean(0))
@@ -254,8 +277,8 @@ def factorize(
         maps = {name: m[None] for name, m in found.items()}
         return maps, {"maps": operators.product(maps)}
 
-    maps, errors = factorized(btf, dict.fromkeys("pqr", 1), map_size, step, one_part)
-    facts |= errors | {
+    maps, squared = factorized(btf, dict.fromkeys("pqr", 1), map_size, step, one_part)
+    facts |= squared | {
         "smoothness": chosen,
         "log_rms": float(np.sqrt(np.concatenate(log_errors).mean())),
     }

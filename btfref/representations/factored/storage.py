@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +21,14 @@ from btfref.representations.factored.definition import (
 from btfref.representations.factored.fit import Steps, unit_tables
 from btfref.representations.lookup import base_meta, direction_arrays, stored
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from btfref.representations.factored.fit import Factors, Step
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.types import Facts, Progress
+
+
 #: Storage of the maps: floats, halves, or 8-bit codes of [0, 1].
 STORAGES = ("float", "half", "byte")
 
@@ -36,6 +45,10 @@ MINI_BATCH_ABOVE = 1 << 16
 
 #: Multiplicative steps of the scales of several terms; with one term the first step is exact.
 SCALE_STEPS = 50
+
+
+#: Inner products of the data with itself (texel, 3), with the terms (texel, 3, term), of terms (texel, 3, term, term).
+Moments = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -71,7 +84,7 @@ class Storing:
     rescale: bool = True
     filter_type: str = "bilinear"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         clusters = self.clusters
         if clusters is not None and (
             isinstance(clusters, bool) or not isinstance(clusters, int) or clusters < 1
@@ -91,22 +104,22 @@ class Storing:
                 raise InputError(f"unknown {name}", field=name, got=repr(value), expected=" or ".join(known))
 
     @property
-    def scale_type(self):
+    def scale_type(self) -> str:
         """Type of the scale map."""
         return self.scale_storage or self.storage
 
     @property
-    def map_power(self):
+    def map_power(self) -> int:
         """What the stored numbers of the maps are raised to."""
         return CODES[self.code] if self.storage == "byte" else 1
 
     @property
-    def scale_power(self):
+    def scale_power(self) -> int:
         """What the stored numbers of the scale map are raised to."""
         return CODES[self.code] if self.scale_type == "byte" else 1
 
 
-def codebook(maps, clusters, seed):
+def codebook(maps: np.ndarray, clusters: int | None, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Prototypes of maps by k-means.
 
     Parameters
@@ -141,7 +154,7 @@ def codebook(maps, clusters, seed):
     return labels, share @ maps
 
 
-def stored_maps(name, maps, storage, power):
+def stored_maps(name: str, maps: np.ndarray, storage: str, power: int) -> np.ndarray:
     """Maps in [0, 1] in the type of ``storage``, as numbers that are raised to ``power``."""
     maps = np.clip(maps, 0, 1) ** (1 / power) if power != 1 else maps
     if storage == "byte":
@@ -149,7 +162,15 @@ def stored_maps(name, maps, storage, power):
     return stored(name, maps, storage)
 
 
-def fitted(btf, factorize, storing, *, seed, progress, more_steps):
+def fitted(
+    btf: SampledBTF,
+    factorize: Callable[[Step], Factors],
+    storing: Storing,
+    *,
+    seed: int,
+    progress: Progress | None,
+    more_steps: int,
+) -> Representation:
     """A whole fit: factors, codebooks, storage.
 
     Parameters
@@ -187,14 +208,16 @@ class Codebooks:
         Of the terms of P · R and of Q · D: together with the prototypes they make the clustered factors.
     """
 
-    factors: object
-    prototypes: dict
-    labels: dict
+    factors: Factors
+    prototypes: dict[str, np.ndarray]
+    labels: dict[str, np.ndarray]
     scale: np.ndarray
     half_scale: np.ndarray
 
 
-def cluster(factors, clusters, *, seed=0, step=lambda label: None):
+def cluster(
+    factors: Factors, clusters: int | None, *, seed: int = 0, step: Step = lambda label: None
+) -> Codebooks:
     """Codebooks of factors.
 
     Parameters
@@ -231,7 +254,9 @@ def cluster(factors, clusters, *, seed=0, step=lambda label: None):
     return Codebooks(factors, prototypes, labels, scale, half_scale)
 
 
-def store(btf, codebooks, storing, *, seed=0, step=lambda label: None):
+def store(
+    btf: SampledBTF, codebooks: Codebooks, storing: Storing, *, seed: int = 0, step: Step = lambda label: None
+) -> Representation:
     """A stored representation.
 
     Parameters
@@ -258,10 +283,9 @@ def store(btf, codebooks, storing, *, seed=0, step=lambda label: None):
         f"factor_{name}": stored_maps(name, maps, storing.storage, power)
         for name, maps in codebooks.prototypes.items()
     }
-    index = list(codebooks.labels.values())
     top = half_scale.max(1, keepdims=True)
     scale, half_scale = scale * top, half_scale / np.where(top > 0, top, 1)
-    index = np.concatenate(index, 1).astype(np.uint32)
+    index = np.concatenate(list(codebooks.labels.values()), 1).astype(np.uint32)
     arrays["index"] = index.reshape(rows, columns, -1)
     if half_scale.shape[1] > 1:
         half_scale_map = stored_maps("half_scale", half_scale, storing.storage, power)
@@ -293,13 +317,14 @@ def store(btf, codebooks, storing, *, seed=0, step=lambda label: None):
     return Representation(arrays | direction_arrays(btf.views, btf.lights), meta)
 
 
-def _moments(btf, arrays, constants, half_scale, exponent):
+def _moments(
+    btf: SampledBTF, arrays: dict[str, np.ndarray], constants: Facts, half_scale: np.ndarray, exponent: float
+) -> tuple[Moments, Moments]:
     """Inner products of data and unscaled terms, per texel and channel: plain ones and weighted ones.
 
     Returns
     -------
-    moments, weighted : tuple of ndarray
-        Of the data with itself (texel, 3), with the terms (texel, 3, term), and of the terms (texel, 3, term, term).
+    moments, weighted : Moments
     """
     operators = map_operators(
         btf.views.vectors, btf.lights.vectors, arrays["factor_p"].shape[1], "factor_d" in arrays
@@ -308,7 +333,7 @@ def _moments(btf, arrays, constants, half_scale, exponent):
     index = arrays["index"].reshape(-1, arrays["index"].shape[-1])
     if "half_scale" in arrays:
         half_scale = decoded(arrays["half_scale"], power).reshape(half_scale.shape)
-    parts = [], []
+    parts: tuple[list[Moments], list[Moments]] = [], []
     for texels in texel_parts(len(index)):
         data, mean = unit_tables(btf, texels)
         factors = {}
@@ -331,13 +356,19 @@ def _moments(btf, arrays, constants, half_scale, exponent):
                     np.einsum("jvlm,kvlm->mjk", terms, heavy).astype(float),
                 )
             )
-    return tuple(
-        tuple(np.concatenate(m).reshape(len(index), 3, *m[0].shape[1:]) for m in zip(*part, strict=True))
-        for part in parts
+    plain, weighted = (_joined(part, len(index)) for part in parts)
+    return plain, weighted
+
+
+def _joined(parts: list[Moments], n_texels: int) -> Moments:
+    """Moments of all texels from those of their parts."""
+    energy, product, gram = (
+        np.concatenate(m).reshape(n_texels, 3, *m[0].shape[1:]) for m in zip(*parts, strict=True)
     )
+    return energy, product, gram
 
 
-def _fitted_scale(moments, scale):
+def _fitted_scale(moments: Moments, scale: np.ndarray) -> np.ndarray:
     """Non-negative scales of the terms that fit the data best, shape (texel, term, 3)."""
     _, product, gram = moments
     fitted = np.where(np.moveaxis(scale, 1, 2) > 0, np.moveaxis(scale, 1, 2), 0).astype(float)
@@ -347,7 +378,7 @@ def _fitted_scale(moments, scale):
     return np.moveaxis(fitted, 1, 2)
 
 
-def _error(moments, scale):
+def _error(moments: Moments, scale: np.ndarray) -> float:
     """Relative squared error of scaled terms."""
     energy, product, gram = moments
     s = np.moveaxis(np.asarray(scale, float), 1, 2)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,6 +29,15 @@ from btfref.representations.file.map_images import (
 from btfref.representations.file.resident import needed_rows, select
 from btfref.representations.file.rows import RowReader
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from numpy.typing import ArrayLike
+
+    from btfref.representations.protocol import Representation
+    from btfref.types import Facts, PathLike
+
+
 ATTRIBUTE = "btfref"
 #: Share of a file's bytes up to which reading its rows one by one is faster than the whole by OpenEXR: the former
 #: takes 2.2 to 2.8 times as long a byte.
@@ -36,7 +46,7 @@ _MAGIC = bytes((0x76, 0x2F, 0x31, 0x01))
 _TYPES = ("float16", "float32", "uint32", "uint8")
 
 
-def save(representation, path):
+def save(representation: Representation, path: PathLike) -> None:
     """Write a representation to ``path`` atomically.
 
     Parameters
@@ -54,7 +64,7 @@ def save(representation, path):
 
     path = Path(path)
     arrays = {name: np.asarray(array) for name, array in representation.arrays().items()}
-    manifest = {
+    manifest: Facts = {
         "schema": SCHEMA_VERSION,
         "kind": "representation",
         "meta": representation.meta,
@@ -72,7 +82,7 @@ def save(representation, path):
             np.int32,
         ),
     )
-    parts = []
+    parts: list[OpenEXR.Part] = []
     for name, image in images.items():
         if image.dtype.name not in _TYPES:
             raise TypeError(f"map {name} must be one of {_TYPES}, got {image.dtype}")
@@ -99,7 +109,14 @@ def save(representation, path):
         OpenEXR.File(parts).write(str(draft))
 
 
-def load(path, *, views=None, lights=None, entries=None, levels=None):
+def load(
+    path: PathLike,
+    *,
+    views: ArrayLike | None = None,
+    lights: ArrayLike | None = None,
+    entries: ArrayLike | None = None,
+    levels: ArrayLike | None = None,
+) -> Representation:
     """Read a representation.
 
     Parameters
@@ -142,7 +159,7 @@ def load(path, *, views=None, lights=None, entries=None, levels=None):
     return kind.from_arrays(arrays, meta)
 
 
-def read_maps(path, wanted):
+def read_maps(path: PathLike, wanted: Callable[[str], bool]) -> tuple[dict[str, np.ndarray], Facts]:
     """Some maps of a file, the others not read.
 
     Parameters
@@ -173,7 +190,7 @@ def read_maps(path, wanted):
     return arrays, manifest["meta"]
 
 
-def bytes_of_choice(path, choice):
+def bytes_of_choice(path: PathLike, choice: Mapping[str, ArrayLike | None]) -> int:
     """How many bytes of a file :func:`load` reads for a choice of views, lights, entries and levels.
 
     Parameters
@@ -187,14 +204,17 @@ def bytes_of_choice(path, choice):
     int
     """
     manifest, _ = _open(path, header_only=True)
-    found = []
-    _read_some(
-        path, manifest, {"views": None, "lights": None, "entries": None, "levels": None} | choice, found
-    )
+    found: list[int] = []
+    _read_some(path, manifest, choice, found)
     return found[0] if found else Path(path).stat().st_size
 
 
-def _read_some(path, manifest, choice, bytes_read=None):
+def _read_some(
+    path: PathLike,
+    manifest: Facts,
+    choice: Mapping[str, ArrayLike | None],
+    bytes_read: list[int] | None = None,
+) -> dict[str, np.ndarray] | None:
     """The maps with the rows that a choice needs, or None where reading the whole file takes no longer."""
     kind = method(manifest["meta"]["method"], file=path).representation
     sizes = {
@@ -221,7 +241,7 @@ def _read_some(path, manifest, choice, bytes_read=None):
     return arrays
 
 
-def read_info(path):
+def read_info(path: PathLike) -> Facts:
     """Facts about a representation, from its headers only.
 
     Returns
@@ -264,7 +284,7 @@ def read_info(path):
     }
 
 
-def payload_bytes(maps, meta):
+def payload_bytes(maps: Mapping[str, tuple[Sequence[int], str]], meta: Facts) -> int:
     """Bytes of the maps alone, without direction tables.
 
     Parameters
@@ -280,7 +300,7 @@ def payload_bytes(maps, meta):
     )
 
 
-def map_bytes(name, shape, dtype, meta):
+def map_bytes(name: str, shape: Sequence[int], dtype: str, meta: Facts) -> int:
     """Bytes of one map.
 
     Parameters
@@ -306,7 +326,7 @@ def refuse_store(path: Path) -> None:
         )
 
 
-def _open(path, *, header_only):
+def _open(path: PathLike, *, header_only: bool) -> tuple[Facts, dict[str, Any]]:
     """Manifest and parts by name, after every check that needs no pixels."""
     path = Path(path)
     refuse_store(path)
@@ -346,7 +366,7 @@ def _open(path, *, header_only):
     return manifest, parts
 
 
-def _channels_of(path, name, entry, part):
+def _channels_of(path: PathLike, name: str, entry: Facts, part: Any) -> np.ndarray:
     """Pixels of a part, shape (rows, columns, channels), its channels in the order of the map's."""
     shape = file_shape(entry)
     kind = "float16" if entry["dtype"] == "uint8" else entry["dtype"]
@@ -366,7 +386,7 @@ def _channels_of(path, name, entry, part):
     return result
 
 
-def _read_map(path, name, entry, result, manifest):
+def _read_map(path: PathLike, name: str, entry: Facts, result: np.ndarray, manifest: Facts) -> np.ndarray:
     """A map from its pixels, checked."""
     shape, leading = file_shape(entry), entry.get("rows", [])
     byte = entry["dtype"] == "uint8"

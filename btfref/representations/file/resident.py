@@ -15,6 +15,7 @@ A lookup that needs what is not there is an error in NumPy and not a number in t
 from __future__ import annotations
 
 from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,11 +23,20 @@ from btfref.errors import InputError
 from btfref.numerics.sphere.interpolation import MISSING
 from btfref.representations.protocol import HasEntries, HasLevels, Kind, direction_axes
 
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import ArrayLike
+
+    from btfref.representations.protocol import Entries, Representation
+    from btfref.types import Facts, PathLike
+
+
 #: Kinds of directions.
 KINDS: tuple[Kind, ...] = ("view", "light")
 
 
-def slots_name(kind):
+def slots_name(kind: Kind) -> str:
     """Name of the table of slots, uint32 [n, 1]; ports find it beside the direction tables."""
     return f"{kind}_slots"
 
@@ -35,12 +45,19 @@ def slots_name(kind):
 SLOTS = slots_name("view")
 
 
-def with_views(representation, views):
+def with_views(representation: Representation, views: ArrayLike) -> Representation:
     """The representation with the maps of ``views`` only; see :func:`keeping`."""
     return keeping(representation, views=views)
 
 
-def keeping(representation, **choice):
+def keeping(
+    representation: Representation,
+    *,
+    views: ArrayLike | None = None,
+    lights: ArrayLike | None = None,
+    entries: ArrayLike | None = None,
+    levels: ArrayLike | None = None,
+) -> Representation:
     """The representation with the maps of some views, lights, entries and levels only.
 
     Parameters
@@ -65,17 +82,35 @@ def keeping(representation, **choice):
         some.
     """
     made = type(representation)
-    arrays, meta = select(representation.arrays(), representation.meta, made, **choice)
+    arrays, meta = select(
+        representation.arrays(),
+        representation.meta,
+        made,
+        views=views,
+        lights=lights,
+        entries=entries,
+        levels=levels,
+    )
     return made.from_arrays(arrays, meta)
 
 
-def select(arrays, meta, made, *, views=None, lights=None, entries=None, levels=None, file=None):
+def select(
+    arrays: dict[str, np.ndarray],
+    meta: Facts,
+    made: object,
+    *,
+    views: ArrayLike | None = None,
+    lights: ArrayLike | None = None,
+    entries: ArrayLike | None = None,
+    levels: ArrayLike | None = None,
+    file: PathLike | None = None,
+) -> tuple[dict[str, np.ndarray], Facts]:
     """Arrays and meta of class ``made`` with what was chosen; see :func:`keeping`."""
     if entries is not None:
         arrays, meta = _with_entries(arrays, meta, made, entries, file)
     if levels is not None:
         arrays, meta = _with_levels(arrays, meta, made, levels, file)
-    for kind, chosen in (("view", views), ("light", lights)):
+    for kind, chosen in zip(KINDS, (views, lights), strict=True):
         if chosen is not None:
             if meta.get("constants", {}).get("nearest_directions"):
                 # The heaviest neighbour would be chosen among those that are there, and not be missed.
@@ -87,7 +122,9 @@ def select(arrays, meta, made, *, views=None, lights=None, entries=None, levels=
     return arrays, meta
 
 
-def axes_of(made, method, kind="view", *, file=None):
+def axes_of(
+    made: object, method: str, kind: Kind = "view", *, file: PathLike | None = None
+) -> Mapping[str, int]:
     """Maps of a class of representations that have an axis over views or lights, and that axis.
 
     Raises
@@ -101,7 +138,9 @@ def axes_of(made, method, kind="view", *, file=None):
     return axes
 
 
-def _with_entries(arrays, meta, made, entries, file):
+def _with_entries(
+    arrays: dict[str, np.ndarray], meta: Facts, made: object, entries: ArrayLike, file: PathLike | None
+) -> tuple[dict[str, np.ndarray], Facts]:
     names = entries_of(made, meta["method"], file=file)
     sizes = [arrays[name].shape[axis] for name, axis in names.axes.items()]
     if "resident_entries" in meta:
@@ -117,7 +156,9 @@ def _with_entries(arrays, meta, made, entries, file):
     return result, {**meta, "resident_entries": kept.tolist(), "partial": bool(lost.any())}
 
 
-def _with_levels(arrays, meta, made, levels, file):
+def _with_levels(
+    arrays: dict[str, np.ndarray], meta: Facts, made: object, levels: ArrayLike, file: PathLike | None
+) -> tuple[dict[str, np.ndarray], Facts]:
     patterns = levels_of(made, meta["method"], file=file)
     total = len(meta["levels"])
     kept = _checked("levels", levels, total, file)
@@ -138,7 +179,7 @@ def _with_levels(arrays, meta, made, levels, file):
     return result, {**meta, "constants": constants, "resident_levels": kept.tolist()}
 
 
-def entries_of(made, method, *, file=None):
+def entries_of(made: object, method: str, *, file: PathLike | None = None) -> Entries:
     """How texels name entries in a class of representations.
 
     Raises
@@ -151,7 +192,7 @@ def entries_of(made, method, *, file=None):
     return made.ENTRIES
 
 
-def levels_of(made, method, *, file=None):
+def levels_of(made: object, method: str, *, file: PathLike | None = None) -> Sequence[str]:
     """Names of the maps of a level of detail in a class of representations.
 
     Raises
@@ -164,7 +205,9 @@ def levels_of(made, method, *, file=None):
     return made.LEVELS
 
 
-def needed_rows(made, manifest, choice):
+def needed_rows(
+    made: object, manifest: Facts, choice: Mapping[str, ArrayLike | None]
+) -> dict[str, dict[int, np.ndarray]]:
     """Which maps of a file a choice needs, and of which indices along the axes that are rows there.
 
     Parameters
@@ -181,11 +224,13 @@ def needed_rows(made, manifest, choice):
     dict of str to dict of int to array
         By map the indices of each axis that has some alone; a map that is not there is not needed.
     """
-    meta, result = manifest["meta"], {}
+    meta: Facts = manifest["meta"]
+    result = {}
     chosen = {kind: choice.get(f"{kind}s") for kind in KINDS}
     gone = set()
-    if choice.get("levels") is not None and len(choice["levels"]):
-        levels = range(int(np.min(choice["levels"])))
+    wanted, entries = choice.get("levels"), choice.get("entries")
+    if wanted is not None and np.size(wanted):
+        levels = range(int(np.min(wanted)))
         gone = {p.replace("*", str(k)) for p in levels_of(made, meta["method"]) for k in levels}
     for name in manifest["arrays"]:
         if name in gone:
@@ -198,22 +243,29 @@ def needed_rows(made, manifest, choice):
             for pattern, axis in direction_axes(made, kind).items():
                 if fnmatchcase(name, pattern):
                     axes[axis] = np.asarray(indices, np.int64)
-        if choice.get("entries") is not None:
-            axis = entries_of(made, meta["method"]).axes.get(name)
-            if axis is not None:
-                axes[axis] = np.asarray(choice["entries"], np.int64)
+        if entries is not None:
+            own = entries_of(made, meta["method"]).axes.get(name)
+            if own is not None:
+                axes[own] = np.asarray(entries, np.int64)
         result[name] = axes
     return result
 
 
-def slots_of(total, kept):
+def slots_of(total: int, kept: np.ndarray) -> np.ndarray:
     """Table that takes each of ``total`` directions to its place among the sorted ``kept`` ones."""
     table = np.full((total, 1), MISSING, np.uint32)
     table[kept, 0] = np.arange(len(kept))
     return table
 
 
-def _selected(arrays, meta, axes, kind, chosen, file):
+def _selected(
+    arrays: dict[str, np.ndarray],
+    meta: Facts,
+    axes: Mapping[str, int],
+    kind: Kind,
+    chosen: ArrayLike,
+    file: PathLike | None,
+) -> tuple[dict[str, np.ndarray], Facts]:
     field, total = f"{kind}s", meta[f"{kind}s"]["count"]
     chosen = _checked(field, chosen, total, file)
     slots = np.arange(total)
@@ -234,7 +286,7 @@ def _selected(arrays, meta, axes, kind, chosen, file):
     return result, {**meta, f"resident_{field}": chosen.tolist()}
 
 
-def _checked(field, chosen, total, file):
+def _checked(field: str, chosen: ArrayLike, total: int, file: PathLike | None) -> np.ndarray:
     """Sorted indices, at least one, all below ``total``."""
     chosen = np.unique(np.asarray(chosen, np.int64))
     if not len(chosen) or chosen[0] < 0 or chosen[-1] >= total:
@@ -243,7 +295,7 @@ def _checked(field, chosen, total, file):
     return chosen
 
 
-def refuse_absent(values, weight, field):
+def refuse_absent(values: np.ndarray, weight: np.ndarray, field: str) -> np.ndarray:
     """``values`` with 0 where the weight is 0; NaN elsewhere marks texels whose entry is not kept.
 
     Parameters

@@ -11,16 +11,26 @@ import struct
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.errors import InputError
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from typing import Self
+
+    from numpy.typing import ArrayLike
+
+    from btfref.types import PathLike
+
+
 #: Lines of a chunk by code of the compression: none, ZIPS, ZIP.
 LINES = {0: 1, 2: 1, 3: 16}
 
 #: Types of pixels by their code.
-TYPES = {0: np.dtype("<u4"), 1: np.dtype("<f2"), 2: np.dtype("<f4")}
+TYPES: dict[int, np.dtype] = {0: np.dtype("<u4"), 1: np.dtype("<f2"), 2: np.dtype("<f4")}
 
 _MULTI_PART = 0x1000
 
@@ -29,7 +39,7 @@ _MULTI_PART = 0x1000
 class _Part:
     """What the header of a part says: channels in the order of the file, and where its chunks begin."""
 
-    channels: list
+    channels: list[str]
     kind: np.dtype
     compression: int
     rows: int
@@ -38,7 +48,7 @@ class _Part:
     offsets: int
 
     @property
-    def lines(self):
+    def lines(self) -> int:
         """Scan lines of a chunk."""
         return LINES[self.compression]
 
@@ -61,7 +71,7 @@ class RowReader:
         For a damaged or truncated file.
     """
 
-    def __init__(self, path):
+    def __init__(self, path: PathLike) -> None:
         self.path, self.bytes_read = Path(path), 0
         self._stream = self.path.open("rb")
         try:
@@ -70,23 +80,22 @@ class RowReader:
             self._stream.close()
             raise
 
-    def __enter__(self):
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self._stream.close()
 
-    def knows(self, name):
+    def knows(self, name: str) -> bool:
         """Whether a part is there, of scan lines in a compression that is read here."""
-        part = self._parts.get(name)
-        return part is not None and part.compression in LINES and part.kind is not None
+        return name in self._parts
 
-    def share(self, name, rows=None):
+    def share(self, name: str, rows: ArrayLike | None = None) -> float:
         """Share of a part's chunks that hold some rows: what :meth:`read` reads of it."""
         part = self._parts[name]
         return 1.0 if rows is None else len(np.unique(np.asarray(rows) // part.lines)) / part.chunks
 
-    def read(self, name, channels, rows=None):
+    def read(self, name: str, channels: Sequence[str], rows: ArrayLike | None = None) -> np.ndarray:
         """Pixels of a part.
 
         Parameters
@@ -125,16 +134,15 @@ class RowReader:
             _, row, size = struct.unpack("<iii", self._take(12))
             if row != first or not 0 <= size <= count * line:
                 raise self._damaged(f"chunk {chunk} of {name}")
-            data = self._take(size)
-            data = np.frombuffer(
-                data if size == count * line else self._inflated(data, count * line), np.uint8
-            )
+            stored = self._take(size)
+            whole = size == count * line
+            data = np.frombuffer(stored, np.uint8) if whole else self._inflated(stored, count * line)
             # Of each line one channel after the other.
             pixels = data.view(part.kind).reshape(count, len(channels), part.columns)
             result[first : first + count] = np.moveaxis(pixels[:, place], 1, -1)
         return result
 
-    def _inflated(self, data, size):
+    def _inflated(self, data: bytes, size: int) -> np.ndarray:
         try:
             found = np.frombuffer(zlib.decompress(data), np.uint8)
         except zlib.error as error:
@@ -149,14 +157,14 @@ class RowReader:
         result[0::2], result[1::2] = whole[:half], whole[half:]
         return result
 
-    def _take(self, n):
+    def _take(self, n: int) -> bytes:
         data = self._stream.read(n)
         if len(data) != n:
             raise self._damaged("its end is missing")
         self.bytes_read += n
         return data
 
-    def _text(self):
+    def _text(self) -> str:
         letters = bytearray()
         while (letter := self._take(1)) != b"\0":
             letters += letter
@@ -164,8 +172,8 @@ class RowReader:
                 raise self._damaged("a name without end")
         return letters.decode("utf-8", "replace")
 
-    def _headers(self):
-        """Parts by name."""
+    def _headers(self) -> dict[str, _Part]:
+        """Parts by name, those that can be read here."""
         _, version = struct.unpack("<ii", self._take(8))
         headers = []
         while True:
@@ -194,20 +202,20 @@ class RowReader:
                 struct.unpack("<i", header["chunkCount"])[0] if "chunkCount" in header else -(-rows // lines)
             )
             kinds = {kind for _, kind in channels}
-            simple = (
-                len(kinds) == 1 and low_y == 0 and header.get("type", b"scanlineimage") == b"scanlineimage"
-            )
-            kind = TYPES.get(kinds.pop()) if simple else None
-            name = header.get("name", b"").rstrip(b"\0").decode("utf-8", "replace")
-            parts[name] = _Part([c for c, _ in channels], kind, compression, rows, columns, chunks, offset)
+            lines_of_one_kind = len(kinds) == 1 and kinds <= TYPES.keys() and low_y == 0
+            simple = lines_of_one_kind and header.get("type", b"scanlineimage") == b"scanlineimage"
+            if simple and compression in LINES:
+                name = header.get("name", b"").rstrip(b"\0").decode("utf-8", "replace")
+                names = [channel for channel, _ in channels]
+                parts[name] = _Part(names, TYPES[kinds.pop()], compression, rows, columns, chunks, offset)
             offset += 8 * chunks
         return parts
 
-    def _damaged(self, what):
+    def _damaged(self, what: str) -> InputError:
         return InputError(f"damaged or truncated OpenEXR file: {what}", file=self.path)
 
 
-def _channels(data):
+def _channels(data: bytes) -> list[tuple[str, int]]:
     """Names and types of a list of channels."""
     result, at = [], 0
     while data[at] != 0:

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from btfref.conventions import FILTER_TYPES
 from btfref.errors import InputError
 from btfref.numerics.heightfield import HEIGHT_LIMIT
 from btfref.numerics.microfacets import isotropic_ndf
-from btfref.numerics.sphere.directions import directions
+from btfref.numerics.sphere.directions import DirectionSet, directions
 from btfref.representations.gbrdf.definition import Representation, field_constants
 from btfref.representations.lookup import direction_arrays, meta_for, stored
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, DTypeLike
+
+    from btfref.types import Facts, PathLike
+
 
 #: Turns are stored in steps of 1/1530: the fully saturated hues of an 8-bit picture, so that pictures lose nothing.
 HUE_STEPS = 6 * 255
@@ -20,23 +28,23 @@ NDF_SIZE = 32
 
 
 def from_maps(
-    height,
+    height: ArrayLike,
     *,
-    diffuse,
-    height_min=-0.1,
-    height_max=0.0,
-    rotation=0.0,
-    fresnel=0.04,
-    material=0,
-    ndf=None,
-    specular=0.0,
-    views="ubo81",
-    lights="ubo81",
-    filter_type="bilinear",
-    storage="half",
-    parameters=None,
-    parent=None,
-):
+    diffuse: ArrayLike,
+    height_min: float = -0.1,
+    height_max: float = 0.0,
+    rotation: ArrayLike = 0.0,
+    fresnel: ArrayLike = 0.04,
+    material: ArrayLike = 0,
+    ndf: ArrayLike | None = None,
+    specular: ArrayLike = 0.0,
+    views: str | DirectionSet | ArrayLike = "ubo81",
+    lights: str | DirectionSet | ArrayLike = "ubo81",
+    filter_type: str = "bilinear",
+    storage: str = "half",
+    parameters: Facts | None = None,
+    parent: Facts | None = None,
+) -> Representation:
     """A g-BRDF from its maps.
 
     Parameters
@@ -92,26 +100,25 @@ def from_maps(
     if ndf.ndim != 4 or ndf.shape[1] != ndf.shape[2] or ndf.shape[3] != 3 or 0 in ndf.shape:
         raise InputError("shape of a map", field="ndf", got=ndf.shape, expected="(materials, n, n, 3)")
     n_materials = len(ndf)
-    material = _broadcast("material", material, shape, None)
-    if material.dtype.kind not in "iu" or material.min() < 0 or material.max() >= n_materials:
-        got = f"{material.dtype} {material.min()} … {material.max()}"
+    names = _broadcast("material", material, shape, None)
+    if names.dtype.kind not in "iu" or names.min() < 0 or names.max() >= n_materials:
+        got = f"{names.dtype} {names.min()} … {names.max()}"
         raise InputError("index map", field="material", got=got, expected=f"integers 0 … {n_materials - 1}")
-    rotation = _broadcast("rotation", rotation, shape)
-    if not np.isfinite(rotation).all():
+    turns = _broadcast("rotation", rotation, shape)
+    if not np.isfinite(turns).all():
         raise InputError("a map holds a value that is not finite", field="rotation")
-    rotation = (np.rint(np.mod(rotation, 1) * HUE_STEPS) % HUE_STEPS / HUE_STEPS).astype(np.float32)
+    turns = (np.rint(np.mod(turns, 1) * HUE_STEPS) % HUE_STEPS / HUE_STEPS).astype(np.float32)
+    colours = _unit("diffuse", _broadcast("diffuse", diffuse, (*shape, 3)))
+    r0 = _unit("fresnel", _broadcast("fresnel", fresnel, shape))
+    amounts = _unit("specular", _broadcast("specular", specular, (n_materials,)))
     maps = {
         "height": _unit("height", height)[..., None].astype(np.float32),
-        "rotation": rotation[..., None],
-        "diffuse": stored("diffuse", _unit("diffuse", _broadcast("diffuse", diffuse, (*shape, 3))), storage),
-        "fresnel": stored("fresnel", _unit("fresnel", _broadcast("fresnel", fresnel, shape)), storage)[
-            ..., None
-        ],
-        "material": material[..., None].astype(np.uint32),
+        "rotation": turns[..., None],
+        "diffuse": stored("diffuse", colours, storage),
+        "fresnel": stored("fresnel", r0, storage)[..., None],
+        "material": names[..., None].astype(np.uint32),
         "ndf": stored("ndf", _unit("ndf", ndf, np.inf), storage),
-        "specular": _unit("specular", _broadcast("specular", specular, (n_materials,)))[:, None].astype(
-            np.float32
-        ),
+        "specular": amounts[:, None].astype(np.float32),
     }
     views, lights = directions(views), directions(lights)
     meta = meta_for("gbrdf", shape, views, lights, parameters or {}, filter_type=filter_type, parent=parent)
@@ -120,14 +127,16 @@ def from_maps(
     return Representation(maps | direction_arrays(views, lights), meta)
 
 
-def _broadcast(name, value, shape, dtype=float):
+def _broadcast(
+    name: str, value: ArrayLike, shape: tuple[int, ...], dtype: DTypeLike | None = float
+) -> np.ndarray:
     try:
         return np.broadcast_to(np.asarray(value, dtype), shape)
     except ValueError:
         raise InputError("shape of a map", field=name, got=np.shape(value), expected=shape) from None
 
 
-def _unit(name, values, largest=1.0):
+def _unit(name: str, values: ArrayLike, largest: float = 1.0) -> np.ndarray:
     """``values`` after the check that they are finite and in [0, largest]."""
     values = np.asarray(values, float)
     if not (np.isfinite(values).all() and values.min() >= 0 and values.max() <= largest):
@@ -138,8 +147,15 @@ def _unit(name, values, largest=1.0):
 
 
 def from_photograph(
-    image, *, depth=0.02, fresnel=0.04, roughness=0.3, specular=0.2, rotation=0.125, **parameters
-):
+    image: PathLike | np.ndarray,
+    *,
+    depth: float = 0.02,
+    fresnel: float = 0.04,
+    roughness: float = 0.3,
+    specular: float = 0.2,
+    rotation: float = 0.125,
+    **parameters: Any,
+) -> Representation:
     """A g-BRDF from one picture, as the last example of the paper (section 6, figure 13).
 
     The picture becomes the diffuse map, its luminance the height, and one distribution a minor highlight.
@@ -165,8 +181,10 @@ def from_photograph(
     from btfref.mesostructure.checks import number
     from btfref.mesostructure.materials import linear_colours, read_image
 
-    name = None if isinstance(image, np.ndarray) else str(image)
-    colours = image if name is None else np.clip(linear_colours(read_image(image)), 0, 1)
+    if isinstance(image, np.ndarray):
+        name, colours = None, image
+    else:
+        name, colours = str(image), np.clip(linear_colours(read_image(image)), 0, 1)
     if colours.ndim != 3 or colours.shape[-1] != 3:
         raise InputError(
             "shape of a picture", field="image", got=colours.shape, expected="(rows, columns, 3)"

@@ -13,7 +13,7 @@ largest albedo of the distribution, because one of integral 1 may reflect up to 
 from __future__ import annotations
 
 from functools import cached_property
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -28,6 +28,15 @@ from btfref.representations.file.resident import refuse_absent
 from btfref.representations.guide import group_means, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points
 from btfref.representations.protocol import Entries
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from numpy.typing import ArrayLike
+
+    from btfref.numerics.heightfield import Hit
+    from btfref.types import Facts
+
 
 #: Tiles by which a port's hit may differ from the definition's: float32 positions at the far end of the longest ray.
 HIT_TOLERANCE = 2e-6
@@ -57,17 +66,17 @@ class Representation(StoredMaps):
     ENTRIES: ClassVar = Entries("material", {"ndf": 0, "specular": 0}, "fresnel")
 
     @classmethod
-    def from_arrays(cls, arrays, meta):
+    def from_arrays(cls, arrays: dict[str, np.ndarray], meta: Facts) -> Self:
         """The representation whose :meth:`arrays` and ``meta`` these are; derived constants are made anew."""
         return cls(arrays, meta | {"constants": field_constants(arrays, meta["constants"])})
 
     @cached_property
-    def field(self):
+    def field(self) -> HeightField:
         """The height field."""
         return height_field(self.maps["height"], self.meta["constants"])
 
     @cached_property
-    def specular_scale(self):
+    def specular_scale(self) -> np.ndarray:
         """c_s of each texel after the limit of energy, float32 (rows, columns).
 
         ``min(c_s, (1 − max_c c_d) / A(r0))``: the albedo is at most 1 for whatever maps.
@@ -88,7 +97,7 @@ class Representation(StoredMaps):
         return np.where(bound > 0, limited, 0).astype(np.float32)
 
     @cached_property
-    def port_tables(self):
+    def port_tables(self) -> dict[str, np.ndarray]:
         """What the ports and the definition read, by texel; see :meth:`port_arrays`."""
         # Made once for all ports, in whatever precision a lookup computes.
         with computing_in(np.float64):
@@ -103,7 +112,7 @@ class Representation(StoredMaps):
             "gloss": np.pad(gloss, [(0, 0), (0, 0), (0, 2)]),
         }
 
-    def port_arrays(self):
+    def port_arrays(self) -> dict[str, np.ndarray]:
         """``cells`` corner heights; ``surface`` slopes, cosine and sine of the rotation; ``colour`` c_d and r0;
         ``gloss`` material and limited c_s; ``ndf``; and the direction tables.
         """  # noqa: D205
@@ -112,20 +121,25 @@ class Representation(StoredMaps):
         kept = {"ndf", *(name for name in self.maps if name.startswith(("view_", "light_")))}
         return self.port_tables | packed_arrays({name: self.maps[name] for name in kept})
 
-    def seen_texels(self, uv, w_view):
+    def seen_texels(self, uv: ArrayLike, w_view: ArrayLike) -> np.ndarray:
         """Texels that lookups blend, where view rays meet the surface: flat indices, shape (N, 2), (N, 3) -> (N, T)."""
-        return texel_weights(self.field.view_hits(uv, w_view), self.field.shape, self.meta["filter_type"])[0]
+        hit = self.field.view_hits(np.asarray(uv, float), np.asarray(w_view, float))
+        return texel_weights(hit, self.field.shape, self.meta["filter_type"])[0]
 
-    def evaluate(self, uv, w_light, w_view, *, lod=0.0):
+    def evaluate(
+        self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
+    ) -> np.ndarray:
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored. Never negative."""
 
-        def lookup(uv, w_light, w_view):
+        def lookup(uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray) -> np.ndarray:
             hit = self.field.view_hits(uv, w_view)
             return self.shade(hit, w_light, w_view)
 
         return evaluate_points(lookup, uv, w_light, w_view)
 
-    def spread(self, uv, w_light, w_view, *, tolerance=HIT_TOLERANCE):
+    def spread(
+        self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, tolerance: float = HIT_TOLERANCE
+    ) -> np.ndarray:
         """How much the definition changes when the hit moves by a tolerance: silhouettes and borders of shadows.
 
         Parameters
@@ -154,7 +168,9 @@ class Representation(StoredMaps):
             largest = np.maximum(largest, np.abs(self.evaluate(*case) - here))
         return largest
 
-    def shade(self, hit, w_light, w_view, *, lit=None):
+    def shade(
+        self, hit: Hit, w_light: np.ndarray, w_view: np.ndarray, *, lit: np.ndarray | None = None
+    ) -> np.ndarray:
         """B of points on the surface.
 
         Parameters
@@ -201,7 +217,7 @@ class Representation(StoredMaps):
         value[lit] = diffuse + factor[:, None] * np.einsum("nt,ntc->nc", share, p)
         return value
 
-    def sampling_tables(self):
+    def sampling_tables(self) -> tuple[np.ndarray, np.ndarray]:
         """Groups of points of the surface alike (by B from above), and means over a few members of each.
 
         The plugin looks the group up where the view ray hits.
@@ -228,7 +244,7 @@ class Representation(StoredMaps):
         means = group_means(labels[members], self._luminance(members, lights, views).astype(np.float32))
         return labels.reshape(rows, columns), means
 
-    def _luminance(self, texels, lights, views):
+    def _luminance(self, texels: np.ndarray, lights: np.ndarray, views: np.ndarray) -> np.ndarray:
         """Luminance of B at texel centres on the surface, shape (n, n_views, n_lights)."""
         n, n_lights = len(texels), len(lights)
         pairs = np.repeat(np.arange(n), n_lights)
@@ -248,14 +264,14 @@ class Representation(StoredMaps):
         return result.reshape(n, n_lights, -1).swapaxes(1, 2)
 
 
-def height_field(height, constants):
+def height_field(height: np.ndarray, constants: Facts) -> HeightField:
     """The field of a map of heights in [0, 1], rounded to float32 as the ports have it."""
     low, high = constants["height_min"], constants["height_max"]
     heights = low + (high - low) * np.asarray(height, float)[..., 0]
     return HeightField(heights.astype(np.float32))
 
 
-def field_constants(arrays, constants):
+def field_constants(arrays: dict[str, np.ndarray], constants: Facts) -> Facts:
     """Constants of the ports, from the maps and ``height_min`` and ``height_max``; the others are kept."""
     field = height_field(arrays["height"], constants)
     return constants | {
@@ -267,12 +283,12 @@ def field_constants(arrays, constants):
     }
 
 
-def texel_uv(index, rows, columns):
+def texel_uv(index: np.ndarray, rows: int, columns: int) -> np.ndarray:
     """Texture coordinates of texel centres, shape (N,) -> (N, 2)."""
     return np.stack([(index % columns + 0.5) / columns, (index // columns + 0.5) / rows], -1)
 
 
-def texel_weights(hit, shape, filter_type):
+def texel_weights(hit: Hit, shape: tuple[int, ...], filter_type: str) -> tuple[np.ndarray, np.ndarray]:
     """Texels that a point blends, as flat indices (N, T), and their weights; see `conventions.texel_stencil`."""
     rows, columns = shape
     c0, r0 = hit.cell.T

@@ -6,12 +6,21 @@ Heights are rays from above, materials the BSDFs of the parts; neither interrefl
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.heightfield import HeightField
 from btfref.numerics.sphere.directions import directions
+
+if TYPE_CHECKING:
+    from btfref.mesostructure.base import Mesostructure, Part
+    from btfref.numerics.sphere.directions import DirectionSet
+    from btfref.representations.gbrdf.definition import Representation
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.types import JitArray, PathLike
+
 
 #: Directions at which a part's BSDF is evaluated to find its distribution.
 _DIRECTIONS = "ubo151"
@@ -21,8 +30,14 @@ _TEXTURED_DIRECTIONS = "10x5"
 
 
 def from_mesostructure(
-    mesostructure, *, texels=64, ndf_size=32, storage="half", filter_type="bilinear", **parameters
-):
+    mesostructure: PathLike | Mesostructure,
+    *,
+    texels: int = 64,
+    ndf_size: int = 32,
+    storage: str = "half",
+    filter_type: str = "bilinear",
+    **parameters: Any,
+) -> Representation:
     """The g-BRDF of a mesostructure, without a BTF.
 
     Parameters
@@ -90,7 +105,7 @@ def from_mesostructure(
     )
 
 
-def _set_variant():
+def _set_variant() -> str | None:
     """Mitsuba's LLVM variant; returns the one that was set before."""
     from btfref.platform import prepare_llvm
 
@@ -102,7 +117,7 @@ def _set_variant():
     return previous
 
 
-def _seen_from_above(made, texels):
+def _seen_from_above(made: Mesostructure, texels: int) -> SimpleNamespace:
     """Height, part, texture coordinates and rotation of the tangent under each texel's centre."""
     import mitsuba as mi
 
@@ -137,7 +152,7 @@ def _seen_from_above(made, texels):
     )
 
 
-def _material(bsdf, part, uv, ndf_size):
+def _material(bsdf: JitArray, part: Part, uv: np.ndarray, ndf_size: int) -> dict[str, np.ndarray]:
     """Parameters of a part's BSDF: those of a flat BTF made of it, a column of texels."""
     from btfref.representations.gbrdf.decomposition.reflectance import (
         SurfaceSamples,
@@ -152,7 +167,7 @@ def _material(bsdf, part, uv, ndf_size):
     return material_reflectance(surface, labels, 1, size=ndf_size)
 
 
-def _flat_btf(bsdf, uv, w):
+def _flat_btf(bsdf: JitArray, uv: np.ndarray, w: DirectionSet) -> SampledBTF:
     """A plane of the BSDF as a sampled BTF in memory, one texel for each texture coordinate."""
     import drjit as dr
     import mitsuba as mi

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import tomllib
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,13 +20,20 @@ from btfref.numerics.sphere.directions import directions
 from btfref.outputs import new_folder
 from btfref.representations.gbrdf.build import HUE_STEPS, from_maps
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from btfref.representations.gbrdf.definition import Representation
+    from btfref.types import Facts, PathLike
+
+
 SCALARS = "maps.toml"
 
 #: Colours of the first materials in the palette of ``material.png``; the others repeat them.
 PALETTE = ((214, 69, 65), (65, 131, 215), (245, 215, 110), (63, 195, 128), (155, 89, 182), (242, 120, 75))
 
 
-def hue_of_turns(rotation):
+def hue_of_turns(rotation: ArrayLike) -> np.ndarray:
     """Pictures of turns as fully saturated hues: 0 red, 1/3 green, 2/3 blue; (...) -> uint8 (..., 3)."""
     code = np.rint(np.asarray(rotation, float) * HUE_STEPS).astype(int) % HUE_STEPS
     sector, rest = np.divmod(code, 255)
@@ -42,7 +50,7 @@ def hue_of_turns(rotation):
     return np.stack([np.choose(sector, [c[k] for c in choices]) for k in range(3)], -1).astype(np.uint8)
 
 
-def turns_of_hue(colours):
+def turns_of_hue(colours: ArrayLike) -> np.ndarray:
     """Turns of any colours by their hue; grey has none and counts as 0. Shape (..., 3) -> float64 (...)."""
     colours = np.asarray(colours, float)
     high, low = colours.max(-1), colours.min(-1)
@@ -52,7 +60,7 @@ def turns_of_hue(colours):
     return np.where(high > low, np.mod(hue / 6, 1), 0.0)
 
 
-def export_maps(representation, out):
+def export_maps(representation: Representation, out: PathLike) -> Facts:
     """Write the maps of a g-BRDF into a new folder.
 
     Parameters
@@ -82,7 +90,7 @@ def export_maps(representation, out):
         )
     with new_folder(out) as folder:
 
-        def exr(stem, image):
+        def exr(stem: str, image: np.ndarray) -> None:
             planes = dict(zip("Y" if image.shape[-1] == 1 else "RGB", np.moveaxis(image, -1, 0), strict=True))
             write_exr(planes, folder / f"{stem}.exr", image.dtype.type)
 
@@ -98,7 +106,7 @@ def export_maps(representation, out):
     return {"format": "maps", "maps": 6, "images": 5 + len(maps["ndf"])}
 
 
-def _scalars(maps, meta):
+def _scalars(maps: dict[str, np.ndarray], meta: Facts) -> str:
     storage = "half" if maps["diffuse"].dtype == np.float16 else "float"
     lines = [
         "# Scalars of a g-BRDF; the pictures beside this file are its maps.",
@@ -118,7 +126,7 @@ def _scalars(maps, meta):
     return "\n".join(lines) + "\n"
 
 
-def import_maps(folder):
+def import_maps(folder: PathLike) -> Representation:
     """A g-BRDF from a folder that :func:`export_maps` wrote, edited or not.
 
     Parameters
@@ -141,7 +149,9 @@ def import_maps(folder):
     try:
         scalars = tomllib.loads(path.read_text(encoding="utf-8"))
         parameters, parent = (json.loads(scalars[name]) for name in ("parameters", "parent"))
-        settings = {name: scalars[name] for name in ("height_min", "height_max", "filter_type", "storage")}
+        settings: Facts = {
+            name: scalars[name] for name in ("height_min", "height_max", "filter_type", "storage")
+        }
         specular = np.asarray(scalars["specular"], float)
         sets = {
             name: directions(spec if isinstance(spec, str) else np.asarray(spec, float))
@@ -155,9 +165,9 @@ def import_maps(folder):
             "distributions", file=folder, got=", ".join(stems) or "none", expected="ndf_0, ndf_1, …"
         )
     height = _numbers(folder, "height")
-    maps = {"fresnel": _numbers(folder, "fresnel"), "rotation": turns_of_hue(_picture(folder, "rotation")[0])}
-    maps["material"] = _indices(folder, "material")
-    maps["diffuse"] = _colours(folder, "diffuse")
+    fresnel, diffuse = _numbers(folder, "fresnel"), _colours(folder, "diffuse")
+    rotation, material = turns_of_hue(_picture(folder, "rotation")[0]), _indices(folder, "material")
+    maps = {"fresnel": fresnel, "rotation": rotation, "material": material, "diffuse": diffuse}
     for name, image in maps.items():
         if image.shape[:2] != height.shape:
             raise InputError(
@@ -169,13 +179,17 @@ def import_maps(folder):
     try:
         return from_maps(
             height,
-            **maps,
+            diffuse=diffuse,
+            fresnel=fresnel,
+            rotation=rotation,
+            material=material,
             ndf=np.stack(tables),
             specular=specular,
             parameters=parameters,
             parent=parent,
+            views=sets["views"],
+            lights=sets["lights"],
             **settings,
-            **sets,
         )
     except InputError as error:
         raise InputError(
@@ -183,7 +197,7 @@ def import_maps(folder):
         ) from None
 
 
-def _picture(folder, stem):
+def _picture(folder: Path, stem: str) -> tuple[np.ndarray, Path]:
     """The one picture of a map, and its path."""
     from btfref.mesostructure.materials import read_image
 
@@ -194,13 +208,13 @@ def _picture(folder, stem):
     return read_image(found[0], field=stem), found[0]
 
 
-def _numbers(folder, stem):
+def _numbers(folder: Path, stem: str) -> np.ndarray:
     from btfref.mesostructure.materials import as_numbers
 
     return as_numbers(_picture(folder, stem)[0])[..., 0]
 
 
-def _colours(folder, stem):
+def _colours(folder: Path, stem: str) -> np.ndarray:
     """Linear colours in float64; unlike for textures, floats are not rounded."""
     from btfref.mesostructure.materials import linear_colours
 
@@ -209,7 +223,7 @@ def _colours(folder, stem):
     return np.broadcast_to(values, (*values.shape[:2], 3))
 
 
-def _indices(folder, stem):
+def _indices(folder: Path, stem: str) -> np.ndarray:
     from PIL import Image
 
     image, path = _picture(folder, stem)

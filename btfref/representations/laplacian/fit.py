@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from btfref.errors import InputError
@@ -13,6 +15,13 @@ from btfref.representations.analytic.light_functions import edge_constants
 from btfref.representations.laplacian.levels import Representation
 from btfref.representations.lookup import base_meta, direction_arrays, stored
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.types import Facts, Progress
+
+
 #: Numbers of components of Y, Cb and Cr at each level (section 3.3 of the paper).
 COMPONENTS = (8, 2, 2)
 
@@ -23,6 +32,9 @@ LARGEST = 64
 #: is within the error that the components leave at their usual numbers. Otherwise the mean is stored.
 PHONG_LIMIT = 0.02
 
+#: Weights and basis of one channel of a level as they are stored.
+Stored = tuple[np.ndarray, np.ndarray]
+
 _CHOICES = {
     "mean": ("auto", "phong", "stored"),
     "prediction": ("closed", "open"),
@@ -31,20 +43,20 @@ _CHOICES = {
 
 
 def fit(
-    btf,
+    btf: SampledBTF,
     *,
-    seed=0,
-    progress=None,
-    levels=None,
-    components=COMPONENTS,
-    target_error=None,
-    mean="auto",
-    reduction="binomial",
-    prediction="closed",
-    directions="interpolated",
-    storage="half",
-    filter_type=None,
-):
+    seed: int = 0,
+    progress: Progress | None = None,
+    levels: int | None = None,
+    components: int | str | Sequence[int] = COMPONENTS,
+    target_error: float | None = None,
+    mean: str = "auto",
+    reduction: str = "binomial",
+    prediction: str = "closed",
+    directions: str = "interpolated",
+    storage: str = "half",
+    filter_type: str | None = None,
+) -> Representation:
     """Laplacian pyramid of ``btf`` with principal components per level.
 
     Parameters
@@ -107,7 +119,7 @@ def fit(
     maps, average, facts = _mean_maps(btf, [image[top] for image in images], mean, storage)
     rng = np.random.default_rng(seed)
     state = _Levels(images, average, prediction == "closed", filter_type, storage, len(btf.views), rng)
-    described = []
+    described: list[Facts] = []
     for k in range(top, -1, -1):
         report(top - k + 1, len(shapes) + 1, f"level {k}")
         own = state.compress(k, counts, target_error)
@@ -133,7 +145,7 @@ def fit(
     return Representation(maps | direction_arrays(btf.views, btf.lights), meta)
 
 
-def packed_layout(n_levels, texels, n_views, n_lights):
+def packed_layout(n_levels: int, texels: Sequence[int], n_views: int, n_lights: int) -> Facts:
     """Bytes of the paper's layout (section 3.3) and of the 24-bit images that it compares them with.
 
     Eigen map: three RGBA floats a direction pair and level, ``48 p q (λ_max + 1)``. Weight map: all levels side by
@@ -155,26 +167,26 @@ def packed_layout(n_levels, texels, n_views, n_lights):
     }
 
 
-def _counts(components):
+def _counts(components: object) -> tuple[int, int, int]:
     """Numbers of components of Y, Cb and Cr from three integers, one for all, or text such as "8,2,2"."""
-    values = components
+    values: Sequence[object] = components if isinstance(components, (list, tuple)) else (components,)
     if isinstance(components, str):
         values = [int(text) if text.strip().isdecimal() else text for text in components.split(",")]
     elif isinstance(components, (int, np.integer)):
         values = (components,) * 3
-    values = list(values) if isinstance(values, (list, tuple)) else [values]
-    good = all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n >= 0 for n in values)
-    if len(values) != 3 or not good or not any(values):
+    numbers = [int(n) for n in values if isinstance(n, (int, np.integer)) and not isinstance(n, bool)]
+    if not len(values) == len(numbers) == 3 or min(numbers) < 0 or not any(numbers):
         raise InputError(
             "numbers of components of Y, Cb and Cr",
             field="components",
             got=repr(components),
             expected="three integers ≥ 0, not all 0",
         )
-    return tuple(int(n) for n in values)
+    y, cb, cr = numbers
+    return y, cb, cr
 
 
-def _constants(btf, levels, directions):
+def _constants(btf: SampledBTF, levels: list[Facts], directions: str) -> Facts:
     """What ports need: levels with components, their sizes and first texels, numbers of components."""
     used = [k for k, level in enumerate(levels) if any(level["components"])]
     n = max(used, default=0) + 1
@@ -201,7 +213,7 @@ def _constants(btf, levels, directions):
     }
 
 
-def _pyramids(btf, n_levels, reduction):
+def _pyramids(btf: SampledBTF, n_levels: int, reduction: str) -> list[list[np.ndarray]]:
     """Gaussian pyramids [channel][level] of shape (rows, columns, pairs), float32."""
     rows, columns = btf.values.shape[2:4]
     matrix = texel_matrix(btf.values)
@@ -211,7 +223,9 @@ def _pyramids(btf, n_levels, reduction):
     return [gaussian_pyramid(matrix @ row.astype(np.float32), n_levels, reduction) for row in FROM_RGB]
 
 
-def _mean_maps(btf, tops, choice, storage):
+def _mean_maps(
+    btf: SampledBTF, tops: list[np.ndarray], choice: str, storage: str
+) -> tuple[dict[str, np.ndarray], list[np.ndarray], Facts]:
     """Mean of the coarsest level: maps, its values [channel] at all pairs as stored, and facts on the Phong model."""
     table = np.stack([top.mean((0, 1), dtype=float) for top in tops], -1)
     shape = len(btf.views), len(btf.lights), 3
@@ -248,14 +262,26 @@ class _Levels:
     rng : numpy.random.Generator
     """
 
-    def __init__(self, images, average, closed, filter_type, storage, n_views, rng):
+    def __init__(
+        self,
+        images: list[list[np.ndarray]],
+        average: list[np.ndarray],
+        closed: bool,
+        filter_type: str,
+        storage: str,
+        n_views: int,
+        rng: np.random.Generator,
+    ) -> None:
         self.images, self.average, self.closed = images, average, closed
         self.filter_type, self.storage, self.n_views, self.rng = filter_type, storage, n_views, rng
-        self.maps, self.level_errors, self.gram = {}, {}, np.zeros((3, 3))
-        #: [channel]: coarser levels as they are stored, (weights, basis), and as they were.
-        self.kept, self.exact = [[] for _ in CHANNELS], [[] for _ in CHANNELS]
+        self.maps: dict[str, np.ndarray] = {}
+        self.level_errors: dict[int, float] = {}
+        self.gram = np.zeros((3, 3))
+        #: [channel]: coarser levels as they are stored, and as they were.
+        self.kept: list[list[Stored]] = [[] for _ in CHANNELS]
+        self.exact: list[list[np.ndarray]] = [[] for _ in CHANNELS]
 
-    def _predicted(self, channel, shape, *, exact):
+    def _predicted(self, channel: int, shape: tuple[int, ...], *, exact: bool) -> np.ndarray:
         """A level from the coarser ones, shape (texels, pairs)."""
         total = np.zeros((int(np.prod(shape)), 1), np.float32) + self.average[channel]
         if exact:
@@ -266,7 +292,7 @@ class _Levels:
                 total += expand_image(weights, shape, self.filter_type).reshape(len(total), -1) @ basis
         return total
 
-    def compress(self, k, counts, target):
+    def compress(self, k: int, counts: tuple[int, int, int] | None, target: float | None) -> list[int]:
         """Compress level k to the given numbers of components, or to as few as reach the target; returns them."""
         shape = self.images[0][k].shape[:2]
         flat = [image[k].reshape(shape[0] * shape[1], -1) for image in self.images]
@@ -277,8 +303,7 @@ class _Levels:
         wanted = counts or (LARGEST,) * 3
         ranges = [self._range(r, min(limit, n)) for r, n in zip(rests, wanted, strict=True)]
         own = [len(basis) for basis, _ in ranges]
-        allowed = None if target is None else target**2 * energy
-        aimed = allowed
+        aimed = allowed = np.inf if target is None else target**2 * energy
         while True:
             if target is not None:
                 own = _fewest(rests, [coordinate for _, coordinate in ranges], aimed, k)
@@ -297,19 +322,19 @@ class _Levels:
         self.level_errors[k] = np.sqrt(error / energy) if energy > 0 else 0.0
         return [int(n) for n in own]
 
-    def _range(self, rest, rank):
+    def _range(self, rest: np.ndarray, rank: int) -> tuple[np.ndarray, np.ndarray]:
         if rank == 0:
             return np.zeros((0, rest.shape[1]), np.float32), np.zeros((len(rest), 0), np.float32)
         return range_basis(rest, rank, self.rng, iterations=2)
 
-    def _stored(self, k, basis, coordinate, n):
+    def _stored(self, k: int, basis: np.ndarray, coordinate: np.ndarray, n: int) -> Stored:
         """Weights and basis of the first components as they are stored."""
         # Axes have unit peak: half floats spend their range on the shape, weights on the amount.
         peak = np.maximum(np.abs(basis[:n]).max(1, initial=0), np.finfo(np.float32).tiny)
         weights = stored(f"weights_{k}", coordinate[:, :n] * peak, self.storage)
         return weights, stored(f"basis_{k}", basis[:n] / peak[:, None], self.storage)
 
-    def _keep(self, k, shape, rests, parts):
+    def _keep(self, k: int, shape: tuple[int, ...], rests: list[np.ndarray], parts: list[Stored]) -> None:
         for channel, (weights, basis) in enumerate(parts):
             if len(basis):
                 wide = weights.astype(np.float32).reshape(*shape, -1), basis.astype(np.float32)
@@ -322,7 +347,7 @@ class _Levels:
             self.maps[f"basis_{k}"] = table
             self.maps[f"weights_{k}"] = np.concatenate([w for w, _ in parts], 1).reshape(*shape, -1)
 
-    def errors(self):
+    def errors(self) -> Facts:
         """JSON-able errors of the finest level and of all."""
         return {
             "error": float(self.level_errors[0] ** 2),
@@ -331,17 +356,17 @@ class _Levels:
         }
 
 
-def _product(part):
+def _product(part: Stored) -> np.ndarray:
     weights, basis = (a.astype(np.float32) for a in part)
     return weights @ basis
 
 
-def _gram(arrays):
+def _gram(arrays: Sequence[np.ndarray]) -> np.ndarray:
     """Inner products of the channels' arrays, shape (3, 3), in float64 by rows."""
     return np.array([[np.einsum("ij,ij->i", a, b).sum(dtype=float) for b in arrays] for a in arrays])
 
 
-def _fewest(rests, coordinates, allowed, level):
+def _fewest(rests: list[np.ndarray], coordinates: list[np.ndarray], allowed: float, level: int) -> list[int]:
     """Numbers of components by channel that leave at most ``allowed`` of weighted squared error, greedily."""
     gains = [
         np.einsum("nk,nk->k", c, c, dtype=float) * w for c, w in zip(coordinates, RGB_WEIGHT, strict=True)

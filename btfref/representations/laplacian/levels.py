@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from btfref.precision import real
 from btfref.representations.analytic.light_functions import held
 from btfref.representations.guide import N_GROUPS, feature_views, group_means, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points, packed_arrays
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 
 class Representation(StoredMaps):
@@ -32,16 +35,18 @@ class Representation(StoredMaps):
     ROWS_BY: ClassVar = {"basis_*": (0,), "mean": (0,)}
 
     @property
-    def first_level(self):
+    def first_level(self) -> int:
         """Finest level that is kept."""
         return self.meta["constants"].get("first_level", 0)
 
     @property
-    def max_lod(self):
+    def max_lod(self) -> float:
         """λ of the coarsest level."""
         return len(self.meta["levels"]) - 1.0
 
-    def evaluate(self, uv, w_light, w_view, *, lod=0.0):
+    def evaluate(
+        self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
+    ) -> np.ndarray:
         """See :meth:`btfref.representations.protocol.Representation.evaluate`.
 
         ``lod`` has the shape of one value a lookup or broadcasts to it; it is clamped to [0, λ_max]. Between whole
@@ -52,7 +57,7 @@ class Representation(StoredMaps):
         nearest = self.meta["constants"]["nearest_directions"]
         levels = self.meta["levels"]
 
-        def lookup(uv, w_light, w_view, lod):
+        def lookup(uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray, lod: np.ndarray) -> np.ndarray:
             view, light = views.stencil(w_view), lights.stencil(w_light, hold=False)
             if nearest:
                 view, light = (_heaviest(*stencil) for stencil in (view, light))
@@ -73,7 +78,13 @@ class Representation(StoredMaps):
 
         return evaluate_points(lookup, uv, w_light, w_view, lod)
 
-    def _mean(self, w_light, w_view, pairs, pair_weight):
+    def _mean(
+        self,
+        w_light: np.ndarray,
+        w_view: np.ndarray,
+        pairs: tuple[np.ndarray, np.ndarray],
+        pair_weight: np.ndarray,
+    ) -> np.ndarray:
         """μ' in Y, Cb, Cr, shape (N, 3)."""
         if "mean" in self.maps:
             return np.einsum("nvl,nvlc->nc", pair_weight, real(self.maps["mean"][pairs]))
@@ -84,7 +95,7 @@ class Representation(StoredMaps):
         result[:, 0] = phong(parameters[:4], light, view)
         return fade[:, None] * result
 
-    def _level(self, k, uv, pairs, pair_weight):
+    def _level(self, k: int, uv: np.ndarray, pairs: list[np.ndarray], pair_weight: np.ndarray) -> np.ndarray:
         """D_kᵀ E_k in Y, Cb, Cr, shape (N, 3)."""
         level = self.meta["levels"][k]
         shape = level["rows"], level["columns"]
@@ -97,7 +108,7 @@ class Representation(StoredMaps):
         ends = np.cumsum([0, *level["components"]])
         return np.stack([product[:, a:b].sum(1) for a, b in pairwise(ends)], -1)
 
-    def tables(self, channel):
+    def tables(self, channel: int) -> np.ndarray:
         """What the stored maps say of one of Y, Cb and Cr at the finest texel centres and the measured pairs.
 
         Parameters
@@ -120,7 +131,7 @@ class Representation(StoredMaps):
                 total += weights @ basis.reshape(-1, end - start).T
         return total
 
-    def port_arrays(self):
+    def port_arrays(self) -> dict[str, np.ndarray]:
         """Two tables of entries of one length, so that ports can loop over levels.
 
         ``basis`` [level, view, light, component] and ``weights`` [texels of all levels, component], of the kept levels
@@ -130,7 +141,7 @@ class Representation(StoredMaps):
         most = [constants[f"n_{name}"] for name in ("y", "cb", "cr")]
         first = np.cumsum([0, *most])
         n_views, n_lights = (len(self.maps[f"{kind}_directions"]) for kind in ("view", "light"))
-        kind = np.float32
+        kind = np.dtype(np.float32)
         for name, table in self.maps.items():
             if name.startswith("basis_"):
                 # Of fewer directions where some are not kept.
@@ -153,11 +164,11 @@ class Representation(StoredMaps):
         return packed_arrays({**others, "basis": basis, "weights": np.concatenate(weights)})
 
     @property
-    def sampling_levels(self):
+    def sampling_levels(self) -> int:
         """Number of levels that :meth:`sampling_tables` has guides for."""
         return len(self.meta["levels"])
 
-    def sampling_tables(self, level=0):
+    def sampling_tables(self, level: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Groups of texels of a level alike, and their means; half as many groups a level."""
         own = self.meta["levels"][level]
         shape = own["rows"], own["columns"]
@@ -172,12 +183,12 @@ class Representation(StoredMaps):
             weights = expand_image(weights, shape, self.meta["filter_type"])
             coefficient.append(weights.reshape(-1, n))
             tables.append(np.moveaxis(self.maps[f"basis_{k}"][..., :n], -1, 0).astype(np.float32))
-        coefficient, table = np.concatenate(coefficient, 1), np.concatenate(tables)
+        amounts, table = np.concatenate(coefficient, 1), np.concatenate(tables)
         some = table[:, feature_views(n_views)].reshape(len(table), -1)
-        labels = texel_groups(coefficient @ some, max(1, N_GROUPS >> level))
-        return labels.reshape(shape), np.tensordot(group_means(labels, coefficient), table, 1)
+        labels = texel_groups(amounts @ some, max(1, N_GROUPS >> level))
+        return labels.reshape(shape), np.tensordot(group_means(labels, amounts), table, 1)
 
-    def _luminance_mean(self):
+    def _luminance_mean(self) -> np.ndarray:
         """μ' of Y at the measured pairs, shape (n_views, n_lights)."""
         if "mean" in self.maps:
             return self.maps["mean"][..., 0].astype(np.float32)
@@ -185,7 +196,7 @@ class Representation(StoredMaps):
         w_view, w_light = np.broadcast_arrays(views[:, None], lights[None])
         return phong(self.maps["phong"][0, :4], w_light, w_view).astype(np.float32)
 
-    def _colour_mean(self, channel):
+    def _colour_mean(self, channel: int) -> np.ndarray:
         """μ' of Cb (1) or Cr (2) at the measured pairs."""
         if "mean" in self.maps:
             return self.maps["mean"][..., channel].astype(np.float32)
@@ -193,7 +204,7 @@ class Representation(StoredMaps):
         return np.full(shape, self.maps["phong"][0, 3 + channel], np.float32)
 
 
-def _heaviest(index, weight):
+def _heaviest(index: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The sample with the largest weight, with the weight of all."""
     best = np.argmax(weight, 1)[:, None]
     return np.take_along_axis(index, best, 1), weight.sum(1, keepdims=True)

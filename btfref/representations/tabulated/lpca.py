@@ -8,7 +8,7 @@ VMV 2003; the same authors, "Fast Environmental Lighting for Local-PCA Encoded B
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -29,6 +29,14 @@ from btfref.representations.lookup import (
     stored,
 )
 from btfref.representations.protocol import Entries
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from btfref.representations.lookup import Stencils
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.types import Progress
+
 
 #: "paper": the setting of the 2004 paper's timings, 16 clusters with a mean and 4 components, in floats.
 PRESETS = {"paper": {"clusters": 16, "components": 4, "storage": "float"}}
@@ -52,7 +60,9 @@ class Representation(StoredMaps):
     ENTRIES: ClassVar = Entries("cluster", {"basis": 0}, "weights")
     ROWS_BY: ClassVar = {"basis": (0, 2)}
 
-    def evaluate(self, uv, w_light, w_view, *, lod=0.0):
+    def evaluate(
+        self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
+    ) -> np.ndarray:
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored.
 
         May be slightly negative where the truncated expansion undershoots.
@@ -64,7 +74,7 @@ class Representation(StoredMaps):
 
         partial = self.meta.get("partial", False)
 
-        def kernel(s):
+        def kernel(s: Stencils) -> np.ndarray:
             own = coefficient[s.texel]
             if partial:
                 own = refuse_absent(own, s.texel_weight, "entries")
@@ -80,7 +90,7 @@ class Representation(StoredMaps):
 
         return evaluate_tabulated(self, kernel, uv, w_light, w_view)
 
-    def port_arrays(self):
+    def port_arrays(self) -> dict[str, np.ndarray]:
         """``basis`` [cluster, view, light, (1 + component) · 3]: one direction pair of one cluster is contiguous."""
         basis = np.moveaxis(self.maps["basis"], 1, 3)
         return packed_arrays(self.maps, basis=basis.reshape(*basis.shape[:3], -1))
@@ -89,7 +99,7 @@ class Representation(StoredMaps):
     harmonic_shader = "environment/lpca_harmonics.glsl"
     transfer_shader = "environment/lpca_transfer.glsl"
 
-    def shared_tables(self):
+    def shared_tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The tables over views and lights that texels share, and how texels combine them.
 
         Returns
@@ -105,7 +115,7 @@ class Representation(StoredMaps):
         weights = np.nan_to_num(self.maps["weights"].reshape(len(cluster), -1).astype(float))
         return self.maps["basis"], cluster, np.concatenate([np.ones((len(weights), 1)), weights], 1)
 
-    def sampling_tables(self):
+    def sampling_tables(self) -> tuple[np.ndarray, np.ndarray]:
         """Groups of texels alike, and their means."""
         basis = conventions.luminance(self.maps["basis"].astype(np.float32))
         cluster = self.maps["cluster"].reshape(-1)
@@ -123,7 +133,16 @@ class Representation(StoredMaps):
         return labels.reshape(self.maps["cluster"].shape[:2]), mean
 
 
-def fit(btf, *, seed=0, progress=None, clusters=16, components=4, storage="half", filter_type="bilinear"):
+def fit(
+    btf: SampledBTF,
+    *,
+    seed: int = 0,
+    progress: Progress | None = None,
+    clusters: int = 16,
+    components: int = 4,
+    storage: str = "half",
+    filter_type: str = "bilinear",
+) -> Representation:
     """Local PCA of ``btf``.
 
     Texels are clustered by reconstruction error in the span of a global PCA, then each cluster's PCA is taken on
@@ -193,7 +212,15 @@ def fit(btf, *, seed=0, progress=None, clusters=16, components=4, storage="half"
     return Representation(maps | direction_arrays(btf.views, btf.lights), meta)
 
 
-def _cluster_bases(matrix, squares, subspace, coordinates, labels, clusters, components):
+def _cluster_bases(
+    matrix: np.ndarray,
+    squares: np.ndarray,
+    subspace: np.ndarray,
+    coordinates: np.ndarray,
+    labels: np.ndarray,
+    clusters: int,
+    components: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Mean, axes and weights of each cluster from full vectors, and the squared error left.
 
     The clusters' axes within the subspace are the start of one step of subspace iteration on the full vectors.
@@ -204,14 +231,17 @@ def _cluster_bases(matrix, squares, subspace, coordinates, labels, clusters, com
     error = 0.0
     groups = [np.flatnonzero(labels == k) for k in range(clusters)]
     with one_blas_thread():
-        starts = [leading_axes(coordinates[m], components + OVERSAMPLING) if len(m) else None for m in groups]
-    for k, members in enumerate(groups):
-        if not len(members):
-            continue
+        starts = {
+            k: leading_axes(coordinates[members], components + OVERSAMPLING)
+            for k, members in enumerate(groups)
+            if len(members)
+        }
+    for k, start in starts.items():
+        members = groups[k]
         block = matrix[members]
         means[k] = block.mean(0)
         block -= means[k]
-        basis, weight = refined_basis(block, starts[k].astype(np.float32) @ subspace)
+        basis, weight = refined_basis(block, start.astype(np.float32) @ subspace)
         rank = min(components, len(basis))
         axes[k, :rank], weights[members, :rank] = basis[:rank], weight[:, :rank]
         error += squares[members].sum() - len(members) * float(means[k].astype(float) @ means[k])

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from btfref import conventions
 from btfref.errors import InputError
 from btfref.precision import real
-from btfref.representations.file.resident import slots_name, slots_of
+from btfref.representations.file.resident import KINDS, slots_name, slots_of
 from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
     StoredMaps,
@@ -19,7 +19,16 @@ from btfref.representations.lookup import (
     meta_for,
 )
 
-PRESETS = {"paper": {}}
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from btfref.representations.lookup import Stencils
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.store.store import BTFStore
+    from btfref.types import Facts, Progress
+
+
+PRESETS: dict[str, Facts] = {"paper": {}}
 
 
 class Representation(StoredMaps):
@@ -27,13 +36,15 @@ class Representation(StoredMaps):
 
     DIRECTION_AXES: ClassVar = {"view": {"values": 2}, "light": {"values": 3}}
 
-    def evaluate(self, uv, w_light, w_view, *, lod=0.0):
+    def evaluate(
+        self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
+    ) -> np.ndarray:
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored."""
         values = self.maps["values"]
         table = values.reshape(-1, *values.shape[2:])
         partial = self.meta.get("partial", False)
 
-        def kernel(s):
+        def kernel(s: Stencils) -> np.ndarray:
             index = (s.texel[:, :, None, None], s.view[:, None, :, None], s.light[:, None, None, :])
             found = real(table[index])
             if partial:
@@ -47,7 +58,7 @@ class Representation(StoredMaps):
 
         return evaluate_tabulated(self, kernel, uv, w_light, w_view)
 
-    def sampling_tables(self):
+    def sampling_tables(self) -> tuple[np.ndarray, np.ndarray]:
         """Groups of texels alike, and their means."""
         values = self.maps["values"]
         table = values.reshape(-1, *values.shape[2:])
@@ -59,7 +70,9 @@ class Representation(StoredMaps):
         return labels.reshape(values.shape[:2]), conventions.luminance(group_means(labels, table))
 
 
-def fit(btf, *, seed=0, progress=None, filter_type="bilinear"):
+def fit(
+    btf: SampledBTF, *, seed: int = 0, progress: Progress | None = None, filter_type: str = "bilinear"
+) -> Representation:
     """The table of ``btf`` in the layout of lookups.
 
     Parameters
@@ -85,7 +98,7 @@ def fit(btf, *, seed=0, progress=None, filter_type="bilinear"):
     return Representation({"values": values, **direction_arrays(btf.views, btf.lights)}, meta)
 
 
-def fit_partial(store, *, filter_type="bilinear"):
+def fit_partial(store: BTFStore, *, filter_type: str = "bilinear") -> Representation:
     """The table of what is there of a store, with the directions of all of it: lookups in that part are the whole's.
 
     Parameters
@@ -126,7 +139,7 @@ def fit_partial(store, *, filter_type="bilinear"):
     meta = meta_for(
         "raw", store.texels, store.views, store.lights, {}, filter_type=filter_type, parent=store.attributes
     )
-    for kind, directions, kept in (("view", store.views, views), ("light", store.lights, lights)):
+    for kind, directions, kept in zip(KINDS, (store.views, store.lights), (views, lights), strict=True):
         if len(kept) < len(directions):
             arrays[slots_name(kind)] = slots_of(len(directions), kept)
             meta[f"resident_{kind}s"] = kept.tolist()

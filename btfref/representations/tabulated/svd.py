@@ -6,7 +6,7 @@ Texture Functions", Texture 2003. ``B_x = Σ_c w_{x,c} E_c``, without a mean.
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -24,6 +24,14 @@ from btfref.representations.lookup import (
     stored,
 )
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from btfref.representations.lookup import Stencils
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.types import Progress
+
+
 #: Koudelka et al. keep 150 components for one texture; 16 cost a lookup about three times what local PCA's 4 cost.
 PRESETS = {"paper": {"components": 150, "storage": "float"}}
 
@@ -34,7 +42,9 @@ class Representation(StoredMaps):
     DIRECTION_AXES: ClassVar = {"view": {"basis": 1}, "light": {"basis": 2}}
     ROWS_BY: ClassVar = {"basis": (1,)}
 
-    def evaluate(self, uv, w_light, w_view, *, lod=0.0):
+    def evaluate(
+        self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
+    ) -> np.ndarray:
         """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored.
 
         May be slightly negative where the truncated expansion undershoots.
@@ -43,19 +53,19 @@ class Representation(StoredMaps):
         weights = self.maps["weights"]
         weights = weights.reshape(-1, weights.shape[-1])
 
-        def kernel(s):
+        def kernel(s: Stencils) -> np.ndarray:
             coefficient = np.einsum("nt,ntk->nk", s.texel_weight, weights[s.texel])
             table = real(basis[:, s.view[:, :, None], s.light[:, None, :]])
             return np.einsum("nk,nvl,knvlc->nc", coefficient, s.pair_weight, table, optimize=True)
 
         return evaluate_tabulated(self, kernel, uv, w_light, w_view)
 
-    def port_arrays(self):
+    def port_arrays(self) -> dict[str, np.ndarray]:
         """``basis`` [view, light, component · 3]: one direction pair is contiguous."""
         basis = np.moveaxis(self.maps["basis"], 0, 2)
         return packed_arrays(self.maps, basis=basis.reshape(*basis.shape[:2], -1))
 
-    def sampling_tables(self):
+    def sampling_tables(self) -> tuple[np.ndarray, np.ndarray]:
         """Groups of texels alike, and their means."""
         weights = self.maps["weights"].astype(np.float32)
         basis = conventions.luminance(self.maps["basis"].astype(np.float32))
@@ -65,7 +75,15 @@ class Representation(StoredMaps):
         return labels.reshape(weights.shape[:2]), np.tensordot(group_means(labels, flat), basis, 1)
 
 
-def fit(btf, *, seed=0, progress=None, components=16, storage="half", filter_type="bilinear"):
+def fit(
+    btf: SampledBTF,
+    *,
+    seed: int = 0,
+    progress: Progress | None = None,
+    components: int = 16,
+    storage: str = "half",
+    filter_type: str = "bilinear",
+) -> Representation:
     """Truncated singular value decomposition of ``btf``.
 
     Parameters

@@ -7,20 +7,29 @@ IJCV 49, 2002.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from btfref.representations.gbrdf.decomposition.pairs import shifted, tangent
+
+if TYPE_CHECKING:
+    from btfref.representations.gbrdf.decomposition.pairs import ReciprocalPairs
+    from btfref.types import Progress
+
 
 #: Variance of log luminance in a window that counts as texture: below it a correlation is noise and fades to 0.
 _QUIET = 1e-4
 
 
-def height_layers(depth, count):
+def height_layers(depth: float, count: int) -> np.ndarray:
     """Candidate heights from ``−depth`` to 0, shape (count,)."""
     return np.linspace(-depth, 0, count)
 
 
-def similarity(pairs, layers, window=5, progress=None):
+def similarity(
+    pairs: ReciprocalPairs, layers: np.ndarray, window: int = 5, progress: Progress | None = None
+) -> np.ndarray:
     """Mean normalized cross-correlation of reciprocal images at each texel and height (eq. 5).
 
     Parameters
@@ -39,15 +48,15 @@ def similarity(pairs, layers, window=5, progress=None):
     """
     from scipy.ndimage import uniform_filter
 
-    mean = lambda image: uniform_filter(image, window, mode="wrap")  # noqa: E731
-    total = None
+    def mean(image: np.ndarray) -> np.ndarray:
+        return uniform_filter(image, window, mode="wrap")
+
+    total = np.zeros((len(layers), *pairs.shape), np.float32)
     for pair in range(len(pairs)):
         first, second = pairs.logarithms(pair)
         # The global means are taken out: variances then lose no digits in float32.
         first, second = first - first.mean(), second - second.mean()
         at = tangent(np.stack([pairs.first[pair], pairs.second[pair]]))
-        if total is None:
-            total = np.zeros((len(layers), *first.shape), np.float32)
         for layer, z in enumerate(layers):
             a, b = shifted(first, -z * at[0]), shifted(second, -z * at[1])
             mean_a, mean_b = mean(a), mean(b)
@@ -56,15 +65,15 @@ def similarity(pairs, layers, window=5, progress=None):
             total[layer] += cross / (np.sqrt(power) + _QUIET)
         if progress:
             progress(pair + 1, len(pairs), "similarity")
-    return total / max(len(pairs), 1) if total is not None else None
+    return total / max(len(pairs), 1)
 
 
-def correlation_heights(volume, layers):
+def correlation_heights(volume: np.ndarray, layers: np.ndarray) -> np.ndarray:
     """The height of the largest correlation, texel by texel: the baseline "NCC" of figure 6."""
     return layers[np.argmax(volume, 0)]
 
 
-def minimum_cut(volume, layers, smoothness=0.1):
+def minimum_cut(volume: np.ndarray, layers: np.ndarray, smoothness: float = 0.1) -> np.ndarray:
     """Heights of least cost by a minimum cut through the volume, periodic over the tile.
 
     A column of nodes a texel; cutting its edge of layer k costs ``(1 − S_k)/2``, and neighbours whose cuts differ by j
@@ -112,7 +121,7 @@ def minimum_cut(volume, layers, smoothness=0.1):
     return _between_layers(volume, layers, label)
 
 
-def _between_layers(volume, layers, label):
+def _between_layers(volume: np.ndarray, layers: np.ndarray, label: np.ndarray) -> np.ndarray:
     """Layer labels refined by the peak of the parabola through three similarities, by at most half a layer."""
     inner = np.clip(label, 1, len(layers) - 2)
     if len(layers) < 3:
@@ -126,7 +135,9 @@ def _between_layers(volume, layers, label):
     return layers[label] + np.clip(offset, -0.5, 0.5) * (layers[1] - layers[0])
 
 
-def helmholtz_stereopsis(pairs, layers, progress=None):
+def helmholtz_stereopsis(
+    pairs: ReciprocalPairs, layers: np.ndarray, progress: Progress | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Heights and normals by reciprocity alone, texel by texel: the baseline of figure 6.
 
     For the right height, ``L(b, a) a − L(a, b) b`` is orthogonal to the normal for all pairs (a, b); the height of the
@@ -137,24 +148,23 @@ def helmholtz_stereopsis(pairs, layers, progress=None):
     heights : ndarray, shape (rows, columns)
     slopes : ndarray, shape (rows, columns, 2)
     """
-    best = None
-    for number, z in enumerate(layers):
-        share, normal = reciprocity_normals(pairs, z)
-        if best is None:
-            best = [share, np.full(share.shape, z), normal]
-        else:
-            better = share < best[0]
-            best = [
-                np.where(better, share, best[0]),
-                np.where(better, z, best[1]),
-                np.where(better[..., None], normal, best[2]),
-            ]
+    least, best = reciprocity_normals(pairs, layers[0])
+    heights = np.full(least.shape, layers[0])
+    for number, z in enumerate(layers[1:], 1):
         if progress:
-            progress(number + 1, len(layers), "Helmholtz stereopsis")
-    return best[1], slopes_of(best[2])
+            progress(number, len(layers), "Helmholtz stereopsis")
+        share, normal = reciprocity_normals(pairs, z)
+        better = share < least
+        least, heights = np.where(better, share, least), np.where(better, z, heights)
+        best = np.where(better[..., None], normal, best)
+    if progress:
+        progress(len(layers), len(layers), "Helmholtz stereopsis")
+    return heights, slopes_of(best)
 
 
-def reciprocity_similarity(pairs, layers, progress=None):
+def reciprocity_similarity(
+    pairs: ReciprocalPairs, layers: np.ndarray, progress: Progress | None = None
+) -> np.ndarray:
     """How well one normal explains all reciprocal pairs of each texel at each height, for :func:`minimum_cut`.
 
     The reciprocity that Helmholtz stereopsis minimises texel by texel, as a volume. It needs no texture in the
@@ -171,17 +181,17 @@ def reciprocity_similarity(pairs, layers, progress=None):
     ndarray of float32, shape (n_layers, rows, columns)
         1 minus twice the residual over its mean range: at most 1, on the scale of a correlation.
     """
-    residual = []
+    shares = []
     for number, z in enumerate(layers):
-        residual.append(reciprocity_normals(pairs, z)[0])
+        shares.append(reciprocity_normals(pairs, z)[0])
         if progress:
             progress(number + 1, len(layers), "reciprocity")
-    residual = np.stack(residual)
+    residual = np.stack(shares)
     spread = float(np.mean(residual.max(0) - residual.min(0)))
     return (1 - 2 * residual / (spread if spread > 0 else 1)).astype(np.float32)
 
 
-def reciprocity_normals(pairs, z):
+def reciprocity_normals(pairs: ReciprocalPairs, z: float) -> tuple[np.ndarray, np.ndarray]:
     """Normals that fit reciprocity best in linear least squares, at one height for all texels.
 
     Returns
@@ -190,14 +200,14 @@ def reciprocity_normals(pairs, z):
         Smallest eigenvalue over the sum of all: 0 where reciprocity holds exactly.
     normal : ndarray, shape (rows, columns, 3)
     """
-    matrix = None
+    matrix = np.zeros((*pairs.shape, 3, 3))
     for pair in range(len(pairs)):
         a, b = pairs.first[pair], pairs.second[pair]
         seen_a, seen_b = pairs.images(pair)
         at = shifted(seen_a, -z * tangent(a)), shifted(seen_b, -z * tangent(b))
         scale = 1 / np.maximum(at[0] + at[1], pairs.black)
         row = ((at[0] * scale)[..., None] * a - (at[1] * scale)[..., None] * b).astype(float)
-        matrix = (0 if matrix is None else matrix) + row[..., :, None] * row[..., None, :]
+        matrix += row[..., :, None] * row[..., None, :]
     values, vectors = np.linalg.eigh(matrix)
     normal = vectors[..., 0]
     normal = normal * np.where(normal[..., 2:] < 0, -1, 1)
@@ -205,7 +215,7 @@ def reciprocity_normals(pairs, z):
     return values[..., 0] / np.where(total > 0, total, 1), normal
 
 
-def slopes_of(normal, limit=5.0):
+def slopes_of(normal: np.ndarray, limit: float = 5.0) -> np.ndarray:
     """Slopes ``−n_xy / n_z`` of normals, held at ``limit``; shape (..., 3) -> (..., 2)."""
     z = np.maximum(normal[..., 2:], 1e-6)
     return np.clip(-normal[..., :2] / z, -limit, limit)

@@ -50,7 +50,7 @@ class Clustering:
     rms: float
 
 
-def spherical_features(ndf, weight=None):
+def spherical_features(ndf: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
     """Distributions over (θ, φ), of unit length, weighted by the solid angles of the grid.
 
     Parameters
@@ -79,7 +79,7 @@ def spherical_features(ndf, weight=None):
     return values.astype(np.float32)
 
 
-def alignment(features, centres):
+def alignment(features: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Squared distances of features to centres at the best turn, and that turn.
 
     By the Fourier shift theorem: the turn is where the cross-correlation over φ, summed over θ, is largest.
@@ -100,13 +100,13 @@ def alignment(features, centres):
     return np.maximum(power - 2 * np.stack(best, 1), 0), np.stack(shift, 1)
 
 
-def turned(features, shift):
+def turned(features: np.ndarray, shift: np.ndarray) -> np.ndarray:
     """``feature(φ + shift)``: features turned back to their centre's frame."""
     index = (np.arange(N_PHI)[None] + shift[:, None]) % N_PHI
     return np.take_along_axis(features, index[:, None, :], 2)
 
 
-def k_means(features, count, rng):
+def k_means(features: np.ndarray, count: int, rng: np.random.Generator) -> Clustering:
     """Lloyd's algorithm with aligned distances; centres are means of aligned members.
 
     Returns
@@ -142,7 +142,7 @@ def k_means(features, count, rng):
     return Clustering(labels, rotation, centres, separation, float(np.sqrt(own.mean())))
 
 
-def relaxed_labels(features, centres, shape):
+def relaxed_labels(features: np.ndarray, centres: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Labels whose borders are smoothed: probabilities 1 / distance, drawn towards those of the neighbours.
 
     Parameters
@@ -166,7 +166,15 @@ def relaxed_labels(features, centres, shape):
     return p.reshape(len(features), -1).argmax(1)
 
 
-def cluster_materials(ndf, shape, *, weight=None, largest=6, count=None, seed=0):
+def cluster_materials(
+    ndf: np.ndarray,
+    shape: tuple[int, ...],
+    *,
+    weight: np.ndarray | None = None,
+    largest: int = 6,
+    count: int | None = None,
+    seed: int = 0,
+) -> tuple[Clustering, dict[int, float]]:
     """Materials of the texels' distributions.
 
     Parameters
@@ -198,7 +206,7 @@ def cluster_materials(ndf, shape, *, weight=None, largest=6, count=None, seed=0)
         found = [k_means(features, min(number, len(features)), rng) for _ in range(1 if number == 1 else 3)]
         tried[number] = min(found, key=lambda c: c.separation)
     indices = {number: c.separation for number, c in tried.items()}
-    best = min(indices, key=indices.get)
+    best = min(indices, key=lambda number: indices[number])
     if not count and (tried[1].rms < _ALIKE or not indices[best] < 1):
         best = 1
     centres = tried[best].centres

@@ -6,10 +6,20 @@ Positions and Normals for Precise 3D Geometry", SIGGRAPH 2005.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from btfref.numerics.heightfield import HeightField
 from btfref.representations.gbrdf.decomposition.pairs import surface_stencil, tangent
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    from btfref.numerics.solvers.levenberg import Model, Samples
+    from btfref.representations.gbrdf.decomposition.pairs import ReciprocalPairs
+    from btfref.types import Facts, JitArray, Progress
+
 
 #: Largest slope that is looked for: 80° from the plane.
 SLOPE_LIMIT = 5.0
@@ -18,7 +28,7 @@ SLOPE_LIMIT = 5.0
 _FACING = 0.02
 
 
-def visible(field, directions):
+def visible(field: HeightField, directions: np.ndarray) -> np.ndarray:
     """Whether the texels' points see directions, bool (rows * columns, n): views and lights alike.
 
     Parameters
@@ -38,7 +48,9 @@ def visible(field, directions):
     return result
 
 
-def helmholtz_normals(pairs, heights, progress=None):
+def helmholtz_normals(
+    pairs: ReciprocalPairs, heights: np.ndarray, progress: Progress | None = None
+) -> tuple[np.ndarray, Facts]:
     """Slopes that minimise ``Σ v log²(ρ(a, b) / ρ(b, a))`` with ``ρ = L / (k1·n)`` (eq. 7).
 
     Parameters
@@ -87,7 +99,9 @@ def helmholtz_normals(pairs, heights, progress=None):
     return fitted.parameters.reshape(*shape, 2).astype(float), fitted.summary
 
 
-def _model(module, ratio, weight, first, second):
+def _model(
+    module: ModuleType, ratio: np.ndarray, weight: np.ndarray, first: np.ndarray, second: np.ndarray
+) -> Model:
     """Residuals and Jacobian for `fit_batch`: parameters are the slopes along u and v."""
     import drjit as dr
 
@@ -98,10 +112,10 @@ def _model(module, ratio, weight, first, second):
     table[:, :3], table[:, 4:7] = first, second
     table = Float(table.ravel())
 
-    def model(p, fit):
+    def model(p: list[JitArray], fit: JitArray) -> tuple[Samples, list[JitArray]]:
         size = dr.sqrt(1 + p[0] * p[0] + p[1] * p[1])
 
-        def facing(w):
+        def facing(w: JitArray) -> tuple[JitArray, JitArray, JitArray]:
             """Logarithm of the cosine times ``size``, and what its derivatives are, up to their sign."""
             x, y, z, _ = w
             cosine = z - x * p[0] - y * p[1]
@@ -109,7 +123,7 @@ def _model(module, ratio, weight, first, second):
             cosine = dr.select(held, _FACING * size, cosine)
             return dr.log(cosine), dr.select(held, 0, x / cosine), dr.select(held, 0, y / cosine)
 
-        def samples(step):
+        def samples(step: JitArray) -> list[tuple[JitArray, list[JitArray]]]:
             log_a, xa, ya = facing(dr.gather(module.Array4f, table, 2 * step))
             log_b, xb, yb = facing(dr.gather(module.Array4f, table, 2 * step + 1))
             at = dr.fma(step, n, fit)
@@ -123,7 +137,7 @@ def _model(module, ratio, weight, first, second):
     return model
 
 
-def fuse(heights, slopes, depth_weight=0.2):
+def fuse(heights: np.ndarray, slopes: np.ndarray, depth_weight: float = 0.2) -> np.ndarray:
     """Heights that are near given ones and whose differences fit given slopes.
 
     Minimises ``λ Σ (h − h0)² + (1 − λ) Σ (difference of neighbours − mean slope between them)²`` on the periodic tile.

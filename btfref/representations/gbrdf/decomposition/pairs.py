@@ -5,9 +5,17 @@ Source: Menzel and Guthe 2009, eq. 3 and 4: ``L(k1, k2) = ρ(k1, k2) (k1·n) L_i
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from btfref.conventions import LUMINANCE
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from btfref.sampling.sampled_btf import SampledBTF
+
 
 #: Directions further from the normal take no part: their images are foreshortened to little more than silhouettes.
 LARGEST_ANGLE = np.radians(62)
@@ -34,12 +42,14 @@ class ReciprocalPairs:
     ----------
     first, second : ndarray of float64, shape (n, 3)
         The two directions of each pair.
+    shape : tuple of int
+        Rows and columns of an image.
     black : float
         Luminance in 1/sr that :meth:`logarithms` holds.
     """
 
-    def __init__(self, btf, count=N_PAIRS, seed=0):
-        self._btf = btf
+    def __init__(self, btf: SampledBTF, count: int = N_PAIRS, seed: int = 0) -> None:
+        self._btf, self.shape = btf, btf.texels
         views = btf.views.vectors
         near = np.flatnonzero(views[:, 2] >= np.cos(LARGEST_ANGLE))
         a, b = (near[i] for i in np.triu_indices(len(near), 1))
@@ -52,10 +62,10 @@ class ReciprocalPairs:
         some = np.asarray(btf.values[:: max(1, len(views) // 8), ::8], np.float32)
         self.black = BLACK * float((some @ LUMINANCE.astype(np.float32)).mean()) + 1e-12
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self._views)
 
-    def images(self, pair):
+    def images(self, pair: int) -> tuple[np.ndarray, np.ndarray]:
         """Luminance seen from the first direction under the second one, and the other way round.
 
         Returns
@@ -65,26 +75,26 @@ class ReciprocalPairs:
         a, b = self._views[pair]
         return self._image(a, b), self._image(b, a)
 
-    def logarithms(self, pair):
+    def logarithms(self, pair: int) -> tuple[np.ndarray, np.ndarray]:
         """Natural logarithms of :meth:`images`, held at ``black``."""
         return tuple(np.log(np.maximum(image, self.black)) for image in self.images(pair))
 
-    def _image(self, view, light):
-        total = 0.0
+    def _image(self, view: int, light: int) -> np.ndarray:
+        total = np.zeros(self.shape, np.float32)
         for index, share in zip(self._light[light], self._share[light], strict=True):
             if share:
                 image = np.asarray(self._btf.values[view, index], np.float32) @ LUMINANCE.astype(np.float32)
-                total = total + np.float32(share) * image
-        return np.broadcast_to(np.asarray(total, np.float32), self._btf.values.shape[2:4])
+                total += np.float32(share) * image
+        return total
 
 
-def tangent(w):
+def tangent(w: ArrayLike) -> np.ndarray:
     """``w_xy / w_z`` of directions, shape (..., 3) -> (..., 2)."""
     w = np.asarray(w, float)
     return w[..., :2] / w[..., 2:]
 
 
-def shifted(image, offset):
+def shifted(image: np.ndarray, offset: ArrayLike) -> np.ndarray:
     """An image of the periodic tile, moved so that each texel shows what is ``offset`` away.
 
     Parameters
@@ -98,7 +108,7 @@ def shifted(image, offset):
     ndarray
         Bilinear between texels.
     """
-    result = 0.0
+    result = np.zeros_like(image)
     size = image.shape[::-1]
     whole = np.floor(np.asarray(offset) * size).astype(int)
     fx, fy = np.asarray(offset) * size - whole
@@ -106,11 +116,11 @@ def shifted(image, offset):
         for dx, wx in ((0, 1 - fx), (1, fx)):
             if wx * wy > 0:
                 moved = np.roll(image, (-whole[1] - dy, -whole[0] - dx), (0, 1))
-                result = result + np.asarray(wx * wy, image.dtype) * moved
+                result += np.asarray(wx * wy, image.dtype) * moved
     return result
 
 
-def surface_stencil(heights, view_tangent):
+def surface_stencil(heights: np.ndarray, view_tangent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Texels that show the points of a height map from a view, and their weights.
 
     Parameters

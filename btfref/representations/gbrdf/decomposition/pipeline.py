@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from btfref.errors import InputError
@@ -19,6 +21,12 @@ from btfref.representations.gbrdf.decomposition.reflectance import (
 )
 from btfref.representations.lookup import positive_integer
 
+if TYPE_CHECKING:
+    from btfref.representations.gbrdf.definition import Representation
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.types import PathLike, Progress
+
+
 #: What heights can be told by.
 SIMILARITIES = ("reciprocity", "correlation")
 
@@ -30,25 +38,25 @@ PRESETS = {
 
 
 def fit(
-    btf,
+    btf: SampledBTF,
     *,
-    seed=0,
-    progress=None,
-    depth=0.25,
-    layers=32,
-    pairs=N_PAIRS,
-    window=5,
-    similarity="reciprocity",
-    smoothness=0.01,
-    depth_weight=0.05,
-    materials=None,
-    largest=6,
-    ndf_size=32,
-    iterations=4,
-    storage="half",
-    filter_type="bilinear",
-    intermediates=None,
-):
+    seed: int = 0,
+    progress: Progress | None = None,
+    depth: float = 0.25,
+    layers: int = 32,
+    pairs: int = N_PAIRS,
+    window: int = 5,
+    similarity: str = "reciprocity",
+    smoothness: float = 0.01,
+    depth_weight: float = 0.05,
+    materials: int | None = None,
+    largest: int = 6,
+    ndf_size: int = 32,
+    iterations: int = 4,
+    storage: str = "half",
+    filter_type: str = "bilinear",
+    intermediates: PathLike | dict[str, np.ndarray] | None = None,
+) -> Representation:
     """Decompose a sampled BTF into a g-BRDF.
 
     Parameters
@@ -103,8 +111,8 @@ def fit(
         For parameters out of range, or values that are not finite.
     """
     named = {"layers": layers, "pairs": pairs, "window": window, "largest": largest, "iterations": iterations}
-    for name, value in named.items():
-        positive_integer(name, value)
+    for name, count in named.items():
+        positive_integer(name, count)
     if materials is not None:
         positive_integer("materials", materials)
     if positive_integer("ndf_size", ndf_size) & (ndf_size - 1):
@@ -196,7 +204,7 @@ def fit(
     return representation
 
 
-def save_stages(stages, path):
+def save_stages(stages: dict[str, np.ndarray], path: PathLike) -> None:
     """Write the maps of the stages as one ``.npz`` file.
 
     Raises
@@ -205,10 +213,10 @@ def save_stages(stages, path):
         When the folder does not exist.
     """
     with new_file(path) as draft, draft.open("wb") as stream:
-        np.savez(stream, **stages)
+        np.savez(stream, allow_pickle=True, **stages)
 
 
-def _refuse_not_finite(btf):
+def _refuse_not_finite(btf: SampledBTF) -> None:
     for view in range(len(btf.views)):
         if not np.isfinite(btf.values[view]).all():
             raise InputError("the BTF holds a value that is not finite", file=btf.path)

@@ -8,6 +8,7 @@ Lumigraph", SIGGRAPH 1996.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +18,12 @@ from btfref.numerics.sphere.frames import surface_frame
 from btfref.numerics.sphere.parabolic import texel_solid_angles
 from btfref.representations.gbrdf.decomposition.normals import visible
 from btfref.representations.gbrdf.decomposition.pairs import surface_stencil, tangent
+
+if TYPE_CHECKING:
+    from btfref.numerics.heightfield import HeightField
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.types import Progress
+
 
 #: Texels a block: bounds the memory of their tables.
 BLOCK = 128
@@ -63,7 +70,7 @@ class Samples:
     place: np.ndarray
     fifth: np.ndarray
 
-    def fresnel(self, r0):
+    def fresnel(self, r0: np.ndarray) -> np.ndarray:
         """F(k1·h), shape (N,) -> (P, N)."""
         return self.fifth + r0 * (1 - self.fifth)
 
@@ -81,7 +88,9 @@ class SurfaceSamples:
         Every so many views only.
     """
 
-    def __init__(self, btf, field, rotation=None, stride=1):
+    def __init__(
+        self, btf: SampledBTF, field: HeightField, rotation: np.ndarray | None = None, stride: int = 1
+    ) -> None:
         self._btf, self._field = btf, field
         self._views = np.flatnonzero(btf.views.vectors[:, 2] > 1e-6)[::stride]
         views, lights = btf.views.vectors[self._views], btf.lights.vectors
@@ -99,11 +108,11 @@ class SurfaceSamples:
         self._fifth = fifth_power((half * lights).sum(-1)).reshape(-1, 1).astype(np.float32)
         self._black = 0.02 * mean_luminance(btf)
 
-    def blocks(self):
+    def blocks(self) -> list[slice]:
         """Texels of each block, as slices of the flat index."""
         return [slice(i, min(i + BLOCK, self.n_texels)) for i in range(0, self.n_texels, BLOCK)]
 
-    def read(self, part, size, group=None, colour=True):
+    def read(self, part: slice, size: int, group: np.ndarray | None = None, colour: bool = True) -> Samples:
         """Samples of some texels.
 
         Parameters
@@ -124,15 +133,15 @@ class SurfaceSamples:
         views, lights = self._directions
         frame = self._frame[part]
         n, n_views, n_lights = len(frame), len(views), len(lights)
-        values = np.zeros((3, n_views, n_lights, n), np.float32)
+        tables = np.zeros((3, n_views, n_lights, n), np.float32)
         for row, (view, (index, share)) in enumerate(zip(self._views, self._stencils, strict=True)):
             images = self._btf.values[view].reshape(n_lights, -1, 3)
             seen = sum(
                 images[:, index[part, k]].astype(np.float32) * share[part, k, None]
                 for k in range(index.shape[1])
             )
-            values[:, row] = np.moveaxis(seen, -1, 0)
-        values = values.reshape(3, -1, n)
+            tables[:, row] = np.moveaxis(seen, -1, 0)
+        values = tables.reshape(3, -1, n)
         luminance = np.tensordot(LUMINANCE.astype(np.float32), values, 1)
         cos_view, cos_light = views @ frame[:, 2].T, lights @ frame[:, 2].T
         there = (self._seen[part].T & (cos_view > GRAZING))[:, None]
@@ -157,13 +166,13 @@ class SurfaceSamples:
         )
 
 
-def mean_luminance(btf):
+def mean_luminance(btf: SampledBTF) -> float:
     """Mean luminance of some of a BTF's samples in 1/sr, a little above 0 for a black one."""
     some = np.asarray(btf.values[:: max(1, len(btf.views) // 8), ::4], np.float32)
     return float((some @ LUMINANCE.astype(np.float32)).mean()) + 1e-9
 
 
-def diffuse_colour(channel, samples, gloss):
+def diffuse_colour(channel: np.ndarray, samples: Samples, gloss: np.ndarray) -> np.ndarray:
     """c_d by eq. 9 to 11, shape (N,) in [0, 1].
 
     Parameters
@@ -177,7 +186,9 @@ def diffuse_colour(channel, samples, gloss):
     return np.clip(_projection(channel - gloss, samples.light), 0, 1)
 
 
-def distribution(rest, amount, samples, size):
+def distribution(
+    rest: np.ndarray, amount: np.ndarray, samples: Samples, size: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Sums over the samples of each texel of the distributions, for p by eq. 12 to 14.
 
     Parameters
@@ -195,30 +206,31 @@ def distribution(rest, amount, samples, size):
     numerator, denominator : ndarray, shape (size,)
     """
     place = samples.place.ravel()
-    return tuple(np.bincount(place, (amount * other).ravel(), size) for other in (rest, amount))
+    numerator, denominator = (np.bincount(place, (amount * a).ravel(), size) for a in (rest, amount))
+    return numerator, denominator
 
 
-def specular_amount(rest, shape):
+def specular_amount(rest: np.ndarray, shape: np.ndarray) -> np.ndarray:
     """c_s by eq. 15 to 17, shape (N,), not yet limited; ``shape`` is the weighted p F k1·n / D."""
     return _projection(rest, shape)
 
 
-def normal_reflectance(rest, shape, samples):
+def normal_reflectance(rest: np.ndarray, shape: np.ndarray, samples: Samples) -> np.ndarray:
     """r0 by eq. 18 to 20, shape (N,) in [0, 1]; ``shape`` is the weighted c_s p k1·n / D."""
     return np.clip(_projection(rest - shape * samples.fifth, shape * (1 - samples.fifth)), 0, 1)
 
 
-def _projection(values, basis):
+def _projection(values: np.ndarray, basis: np.ndarray) -> np.ndarray:
     """Least squares factor of ``basis`` for each texel."""
     return _quotient(np.einsum("pn,pn->n", values, basis), np.einsum("pn,pn->n", basis, basis))
 
 
-def _quotient(a, b):
+def _quotient(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     there = b > 1e-20
     return np.where(there, a / np.where(there, b, 1), 0).astype(a.dtype)
 
 
-def limited_distribution(p):
+def limited_distribution(p: np.ndarray) -> np.ndarray:
     """A table of p that conserves energy, shape (..., n, n): at most 1 / solid angle, integral at most 1."""
     solid_angle = texel_solid_angles(p.shape[-1])
     floor = solid_angle.max() * 1e-3
@@ -226,7 +238,7 @@ def limited_distribution(p):
     return p / np.maximum((p * solid_angle).sum((-2, -1), keepdims=True), 1)
 
 
-def push_pull(values, weight):
+def push_pull(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Tables with holes, filled from coarser levels.
 
     Parameters
@@ -249,7 +261,7 @@ def push_pull(values, weight):
     return weight * values + (1 - weight) * _finer(coarse)
 
 
-def _finer(table):
+def _finer(table: np.ndarray) -> np.ndarray:
     """A table at twice the size, bilinear, held at its borders."""
     for axis in (-2, -1):
         table = np.moveaxis(table, axis, -1)
@@ -260,7 +272,9 @@ def _finer(table):
     return table
 
 
-def texel_reflectance(surface, *, iterations=5, progress=None):
+def texel_reflectance(
+    surface: SurfaceSamples, *, iterations: int = 5, progress: Progress | None = None
+) -> dict[str, np.ndarray]:
     """Parameters of each texel on its own, in luminance: what clustering needs.
 
     Parameters
@@ -303,7 +317,15 @@ def texel_reflectance(surface, *, iterations=5, progress=None):
     return result
 
 
-def material_reflectance(surface, labels, n_materials, *, size=32, iterations=4, progress=None):
+def material_reflectance(
+    surface: SurfaceSamples,
+    labels: np.ndarray,
+    n_materials: int,
+    *,
+    size: int = 32,
+    iterations: int = 4,
+    progress: Progress | None = None,
+) -> dict[str, np.ndarray]:
     """Distributions of the materials, and c_d and r0 of the texels, in colour.
 
     Starts with c_d alone, as the paper does: a distribution that is there first would keep what is diffuse.
