@@ -168,8 +168,8 @@ def test_extractor_reads_atrium_as_we_do(tmp_path):
             ours = radiance.decode(source.read(name.format(int(tl), int(tv))), "x")
         half = 0.5 * 2.0 ** (np.frexp(ours.max(-1, keepdims=True))[1] - 8.0)
         # The one difference: the middle of a code instead of its lower end.
-        np.testing.assert_allclose(ours - half, image, rtol=1e-6)
-        assert np.abs(ours - values[view, light]).max() < 0.02
+        np.testing.assert_allclose(ours - half, image, rtol=tolerance("formats.peer_radiance.rtol"))
+        assert np.abs(ours - values[view, light]).max() < tolerance("formats.peer_radiance.max_abs")
 
 
 @pytest.mark.parametrize("model", [0, 11])
@@ -200,7 +200,7 @@ def test_extractor_clips_what_we_keep(tmp_path):
     _, images = extracted("Ubo2014", tmp_path / "x.btf", tmp_path)
     store = import_btf(tmp_path / "x.btf", tmp_path / "x.btf.zarr")
     assert images.max() == 1
-    assert SampledBTF.load(store.path).values.max() > 2.9
+    assert SampledBTF.load(store.path).values.max() > tolerance("formats.above_one")
 
 
 def test_pysmtb_parses_our_dfmf(tmp_path):
@@ -235,7 +235,9 @@ def test_owners_library_reads_mif_as_we_do(reference, tmp_path):
     assert theirs.shape == (25, 5 + 36)
     source = open_source(path)
     for (view, light), row in zip(by_angles(source, theirs[:, 1:5]), theirs, strict=True):
-        np.testing.assert_allclose(source.colours(view, light, light + 1).ravel(), row[5:], rtol=1e-6)
+        np.testing.assert_allclose(
+            source.colours(view, light, light + 1).ravel(), row[5:], rtol=tolerance("formats.float32.rtol")
+        )
 
 
 def test_owners_code_decodes_as_we_do(tmp_path):

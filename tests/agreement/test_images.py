@@ -8,6 +8,7 @@ from btfref import registry, representations
 from btfref.comparison import compare
 from btfref.conventions import PixelClass
 from btfref.errors import InputError
+from btfref.gates import tolerance
 from btfref.rendering.gl.renderer import realtime
 from btfref.rendering.offline.reference import render
 from btfref.scene.description import read_scene
@@ -148,7 +149,8 @@ def test_shadows_can_be_left_out(llvm):
     lit = render(scene, grid=2, shadows=False).image
     shadowed = render(scene, grid=2).image
     assert (shadowed <= lit).all()
-    assert (shadowed < 0.9 * lit).mean() > 0.02
+    darker = shadowed < tolerance("rendered.shadow.share") * lit
+    assert darker.mean() > tolerance("rendered.shadow.min_pixels")
     traced = render(scene, spp=256, seed=3, with_variance=True)
     comparison = compare(traced, render(scene, grid=16), gate="image.difference", flip=False)
     assert comparison.passed, [gate.line for gate in comparison.gates if not gate.passed]
@@ -187,7 +189,7 @@ def test_a_silhouette_is_where_surfaces_meet_the_background(llvm):
             assert not (
                 (classes == PixelClass.INTERIOR) & (np.roll(classes, step, axis) == PixelClass.BACKGROUND)
             ).any()
-    assert 0.02 < ring.mean() < 0.3
+    assert tolerance("rendered.ring.min_share") < ring.mean() < tolerance("rendered.ring.share")
 
 
 def test_a_fold_in_front_of_the_surface_is_a_silhouette(llvm, tmp_path):
@@ -211,7 +213,11 @@ def test_a_fold_in_front_of_the_surface_is_a_silhouette(llvm, tmp_path):
     trimesh.Trimesh(sheets, faces, process=False).export(tmp_path / "sheets.ply")
     shape = {"type": "ply", "filename": str(tmp_path / "sheets.ply")}
     classes = pixel_classes(room(llvm, shapes={"a": shape}, lights=LIGHTS, size=(64, 64)), grid=2)
-    assert 0.01 < (classes == PixelClass.SILHOUETTE).mean() < 0.15
+    assert (
+        tolerance("rendered.edge.min_share")
+        < (classes == PixelClass.SILHOUETTE).mean()
+        < tolerance("rendered.edge.share")
+    )
     assert (classes == PixelClass.BACKGROUND).sum() == 0
 
 

@@ -7,6 +7,7 @@ from oracle import oracle_btf
 
 from btfref.comparison import compare
 from btfref.conventions import PixelClass
+from btfref.gates import tolerance
 from btfref.platform import shader_directory
 from btfref.registry import methods
 from btfref.rendering.gl import device
@@ -98,8 +99,10 @@ def assert_same_picture(reference, key, name, lights, settings):
     comparison = compare(image, expected, classes=classes, gate=GATES, flip=False)
     assert comparison.passed, [gate.line for gate in comparison.gates if not gate.passed]
     # The scene fills the picture and is lit: the gates saw something.
-    assert (classes == PixelClass.INTERIOR).mean() > 0.2
-    assert (expected.image[classes == PixelClass.INTERIOR].max(-1) > 0).mean() > 0.5
+    assert (classes == PixelClass.INTERIOR).mean() > tolerance("rendered.subject.min_covered_full")
+    assert (expected.image[classes == PixelClass.INTERIOR].max(-1) > 0).mean() > tolerance(
+        "rendered.subject.min_lit"
+    )
     assert image.meta["not_finite"] == 0
 
 

@@ -132,7 +132,9 @@ def test_planted_faults_fail(fault, fits):
     reference = representation.evaluate(*lookups.points)
     good = judge_values(reference.astype(np.float32), reference, representation, lookups, "stress.ports")
     assert not good[0].any()
-    assert good[3].max() <= 0.5 + 1e-6  # rounding to float32 is half a unit in the last place
+    assert 2 * good[3].max() <= 1 + tolerance(
+        "stress.half.rounding"
+    )  # rounding to float32 is half a unit in the last place
     failed, explained, _, _ = judge_values(
         FAULTS[fault](representation, lookups), reference, representation, lookups, "stress.ports"
     )
@@ -160,7 +162,8 @@ def test_lookups_are_reproducible_and_cover_all_kinds(fits):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
     assert set(one.light) == set(one.view) == set(range(len(DIRECTIONS)))
     assert set(one.coordinate) == set(range(len(COORDINATES)))
-    assert 0.3 < conventions.valid_directions(one.w_light).mean() < 0.95
+    valid = conventions.valid_directions(one.w_light).mean()
+    assert tolerance("stress.mixture.min_valid") < valid < tolerance("stress.mixture.valid")
     assert np.array_equal(block(fits("raw"), 3, 6, 2048).uv, one.uv, equal_nan=True) is False
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from plain_renders import PlainRenders
+from scipy.stats import norm
 
 from btfref.comparison.significance import difference_test, welch_test
 from btfref.gates.tolerances import tolerance
@@ -72,7 +73,7 @@ def test_thirty_pairs_equal_plain_renders(llvm, name, estimator):
     rejected, bias, error = _compare(llvm, name, estimator, 30, ROUNDS)
     assert rejected <= tolerance("closing_loop.difference.rejected_fraction")
     # The whole interval of 95 % lies inside the limit: what is undecided does not pass.
-    assert abs(bias) + 1.96 * error <= tolerance("synthesis.surface.bias")
+    assert abs(bias) + norm.ppf(0.975) * error <= tolerance("synthesis.surface.bias")
 
 
 @pytest.mark.parametrize("estimator", ["path", "surface"])

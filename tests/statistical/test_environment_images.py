@@ -79,7 +79,7 @@ def test_spherical_harmonics_say_where_they_fail(fits):
     gates = GATES["lights"]
     image, found = compared(fits.path("lpca"), "sphere", "bright-texel", gates, way="sh")
     assert [gate.outcome for gate in found.gates if gate.name.endswith("relative_rmse")] == ["fail"]
-    assert image.meta["ringing"] > 0.1
+    assert image.meta["ringing"] > tolerance("harmonics.texel.min_ringing")
     assert image.meta["estimated_error"] > tolerance("image.environment_lights.relative_rmse")
 
 
@@ -97,14 +97,15 @@ def test_the_reference_without_shadows_is_unbiased(fits):
     )
     assert found.passed, [gate.line for gate in found.gates]
     shadowed = render(file, spp=256, seed=3, **settings)
-    assert shadowed.image[inside].mean() < 0.8 * plain.image[inside].mean()
+    share = shadowed.image[inside].mean() / plain.image[inside].mean()
+    assert share < tolerance("rendered.bowl.shadowed")
     # The usual integrator, with random positions, has the same mean.
     with loaded(file, parameters, size=(24, 24)) as made:
         batches, variance, spp = regular(made, 2, 250, 0, shadows=True)
     image = batches.mean(0)
     assert spp >= 250
     z = (image - shadowed.image)[inside] / np.sqrt(variance + shadowed.variance)[inside]
-    assert np.abs(z).mean() < 1.0
+    assert np.abs(z).mean() < tolerance("rendered.bowl.mean_z")
     assert abs(z.mean()) * np.sqrt(z.size) < 5
 
 
@@ -153,7 +154,7 @@ def test_the_noisiest_tile_decides_how_long(fits):
     assert found.meta["noise_ratio"] <= 1
     relative = found.variance / found.image.mean() ** 2
     widest = tile_half_widths(relative, mask, significance=tolerance(f"{gate}.significance")).max()
-    assert widest <= 0.5 * tolerance(f"{gate}.relative_tile_bias")
+    assert widest <= tolerance("reference.tile_half_width") * tolerance(f"{gate}.relative_tile_bias")
     # The first round alone does not tell.
     first = converged(file, mask, gate=gate, most=1, **shared)
     assert first.meta["noise_ratio"] > 1

@@ -40,7 +40,9 @@ def test_formats_of_half_floats_are_exact(format, name, settings, material, tmp_
     export_btf(material, tmp_path / name, format, **settings)
     found = back(tmp_path / name)
     assert np.array_equal(found.values, material.values)
-    np.testing.assert_allclose(found.lights.vectors, material.lights.vectors, atol=1e-6)
+    np.testing.assert_allclose(
+        found.lights.vectors, material.lights.vectors, atol=tolerance("formats.float32.atol")
+    )
 
 
 @pytest.mark.parametrize(
@@ -69,7 +71,9 @@ def test_dfmf_errs_as_it_says(components, material, tmp_path):
     original = material.values.astype(float)
     difference = back(tmp_path / "x.btf", dtype="float32").values - original
     error = np.sqrt((difference**2).sum((0, 1, 2, 3)) / (original**2).sum((0, 1, 2, 3)))
-    np.testing.assert_allclose(error, facts["error"], rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(
+        error, facts["error"], rtol=tolerance("formats.stated.rtol"), atol=tolerance("formats.stated.atol")
+    )
 
 
 def test_measured_style(tmp_path, monkeypatch, capsys):
@@ -91,7 +95,12 @@ def test_measured_style(tmp_path, monkeypatch, capsys):
         stream = io.BytesIO()
         Image.fromarray(codes.astype(np.uint8)).save(stream, "JPEG", quality=95, subsampling=0)
         expected = scale * (np.asarray(Image.open(stream)) / 255) ** 2.2
-        np.testing.assert_allclose(imported.values[view, light, ::-1], expected, rtol=1e-3, atol=1e-6)
+        np.testing.assert_allclose(
+            imported.values[view, light, ::-1],
+            expected,
+            rtol=tolerance("formats.half.rtol"),
+            atol=tolerance("formats.half.atol"),
+        )
     size, classes = ["--size", "64x64"], ["--classes", "c.png"]
     for command in (
         ["fit", "lpca", "m.zip.btf.zarr", "-o", "m.exr", "--set", "clusters=4", "components=4"],

@@ -65,7 +65,7 @@ def test_flat_tile_is_lambertian(llvm, files):
     result = render_geometry(scene, spp=8)
     classes = geometry_classes(scene)
     expected = 0.4 / np.pi / np.hypot(0.3, 1.0) * np.array([2.0, 1.5, 1.0])
-    assert (classes == PixelClass.INTERIOR).mean() > 0.1
+    assert (classes == PixelClass.INTERIOR).mean() > tolerance("rendered.subject.min_covered")
     error = np.abs(result.image[classes == PixelClass.INTERIOR] / expected - 1)
     assert error.max() <= tolerance("geometry.flat")
     assert not result.image[classes == PixelClass.BACKGROUND].any()

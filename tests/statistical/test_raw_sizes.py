@@ -2,6 +2,7 @@
 
 import pytest
 
+from btfref.gates import tolerance
 from btfref.sampling import SampledBTF
 from btfref.sampling.store.selection import Selection
 from btfref.sampling.synthesis import synthesize_store
@@ -23,7 +24,7 @@ def test_raw_sizes_of_the_factorization_paper(tmp_path, name, views):
         only=None if views is None else Selection(views=views), variance=False,
     )  # fmt: skip
     assert store.complete == (views is None)
-    assert store.info()["raw_bytes"] / 2**20 == pytest.approx(size, abs=0.05)
+    assert store.info()["raw_bytes"] / 2**20 == pytest.approx(size, abs=tolerance("synthesis.raw_sizes"))
     part = SampledBTF.load(store.path, views=views, partial=True)
     n = len(store.coverage) if views is None else len(views)
     assert 4 * part.values.size == store.info()["raw_bytes"] * n / len(store.coverage)

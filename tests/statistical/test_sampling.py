@@ -116,7 +116,8 @@ def test_weight_is_value_over_density(case, view, llvm, rng):
     assert (pdf > 0).all()
     assert (np.abs(np.array(bs.pdf) - pdf) <= tolerance("sample.pdf.max") * pdf).all()
     error = np.abs(weight * pdf - value)
-    assert (error <= tolerance("sample.weight.max") * np.maximum(np.abs(value), 1e-3 * scale)).all()
+    size = np.maximum(np.abs(value), tolerance("sample.floor") * scale)
+    assert (error <= tolerance("sample.weight.max") * size).all()
     np.testing.assert_array_equal(np.array(both[0]), value)
     np.testing.assert_array_equal(np.array(both[1]), pdf)
     assert (np.array(bs.wo)[2] > 0).all()
@@ -145,7 +146,9 @@ def test_variance_is_at_most_that_of_cosine_sampling(case, view, llvm):
 
     value = table(guided.eval(context, si, w_light))
     density = [table(b.pdf(context, si, w_light)) for b in (guided, cosine)]
-    np.testing.assert_allclose(density[1], np.broadcast_to(w[:, 2] / np.pi, value.shape), rtol=1e-4)
+    np.testing.assert_allclose(
+        density[1], np.broadcast_to(w[:, 2] / np.pi, value.shape), rtol=tolerance("sample.cosine")
+    )
     lobe = w[np.argmax(density[0] / density[1], axis=1)]
     lights = {"constant": np.ones_like(value), "spot": 0.1 + 100 * np.exp(100 * (lobe @ w.T - 1))}
     for name, radiance in lights.items():

@@ -50,7 +50,7 @@ def test_the_target_is_reached_with_honest_variance(tmp_path, tile, estimator, t
     for store, values, variance in ((stores[0], a, va), (stores[1], b, vb)):
         reached = np.sqrt(variance.mean(dtype=np.float64)) / values.mean(dtype=np.float64)
         facts = adaptive.summary(store)
-        assert facts["reached"] == pytest.approx(reached, rel=1e-4)
+        assert facts["reached"] == pytest.approx(reached, rel=tolerance("synthesis.summary"))
         assert reached <= target * tolerance("synthesis.target.exceeded")
         assert facts["samples"]["least"] < facts["samples"]["mean"] < facts["samples"]["most"]
     # Independent runs, whose allocations differ. Lights and channels share their paths; texels and views do not.
@@ -71,7 +71,8 @@ def test_samples_go_where_the_variance_is(tile, tmp_path):
     assert facts["reached"] < error
     samples = store.maps("samples")[:]
     noisy = store.maps("pilot")[..., :2].mean(-1)
-    assert np.corrcoef(np.log(samples).ravel(), np.log(noisy + 1e-12).ravel())[0, 1] > 0.5
+    correlation = np.corrcoef(np.log(samples).ravel(), np.log(noisy + 1e-12).ravel())[0, 1]
+    assert correlation > tolerance("synthesis.seen.min_correlation")
 
 
 def test_a_limit_per_texel_costs_samples_where_it_is_broken(tmp_path, tile):
@@ -142,20 +143,20 @@ def test_an_allocation_meets_its_prediction():
     pilots = [np.stack([s2, s2, np.ones_like(s2)], -1) for s2 in np.exp(rng.normal(0, 2, (6, 32, 32)))]
     for pilot in pilots:  # smooth, so that the neighbours' mean is no surprise
         pilot[..., :2] = pilot[..., :2].mean((0, 1))
-    plan = make_plan(lambda: iter(pilots), target=0.02, texel_error=None, most=1 << 16, whole_views=False)
+    target, texel_error = 0.02, 0.03
+    plan = make_plan(lambda: iter(pilots), target=target, texel_error=None, most=1 << 16, whole_views=False)
     counts = np.stack([plan.counts(pilot) for pilot in pilots])
     s2 = np.stack(pilots)[..., 0]
     error = np.sqrt(np.mean(s2 / counts))
-    assert (
-        0.02 * tolerance("synthesis.target.ladder")
-        <= error
-        <= 0.02 * (1 + tolerance("synthesis.target.classes"))
-    )
-    assert counts.mean() < s2.mean() / 0.02**2
+    assert target * tolerance("synthesis.target.ladder") <= error
+    assert error <= target * (1 + tolerance("synthesis.target.classes"))
+    assert counts.mean() < s2.mean() / target**2
     assert set(np.unique(counts)) <= {8 * 2**k for k in range(14)} | {12 * 2**k for k in range(14)}
-    limited = make_plan(lambda: iter(pilots), target=0.05, texel_error=0.03, most=1 << 16, whole_views=False)
+    limited = make_plan(
+        lambda: iter(pilots), target=0.05, texel_error=texel_error, most=1 << 16, whole_views=False
+    )
     counts = np.stack([limited.counts(pilot) for pilot in pilots])
-    assert np.sqrt(s2 / counts).max() <= 0.03 * (1 + tolerance("synthesis.target.classes"))
+    assert np.sqrt(s2 / counts).max() <= texel_error * (1 + tolerance("synthesis.target.classes"))
     black = [np.zeros((4, 4, 3))]
     plan = make_plan(lambda: iter(black), target=0.02, texel_error=0.01, most=64, whole_views=False)
     assert (plan.counts(black[0]) == adaptive.LEAST).all()

@@ -29,6 +29,7 @@ from btfref.scene.shapes import neighbours
 from btfref.scene.shipped import scene_file
 
 SIZE = (32, 32)
+SUM = tolerance("rendered.sum.rtol")
 
 
 @pytest.fixture(autouse=True)
@@ -134,7 +135,8 @@ def test_light_from_wall_to_wall(fits):
     without, with_one = mean(0), mean(1)
     # In every channel: light takes the walls' colour.
     assert (with_one > without).all()
-    assert (np.abs(with_one - reference) < 0.5 * np.abs(without - reference)).all()
+    left = np.abs(with_one - reference) / np.abs(without - reference)
+    assert (left < tolerance("transfer.bounce.left")).all()
 
 
 def test_light_between_meshes_has_the_walls_colour(fits):
@@ -144,9 +146,9 @@ def test_light_between_meshes_has_the_walls_colour(fits):
     (found,) = vertex_transfer([mesh], 2, bounces=1, albedo=[(0.9, 0.3, 0.0)])
     assert found.shape == (len(mesh.positions), 3, 4, 4)
     sent = found - direct
-    assert np.abs(sent[:, 0]).max() > 0.01
-    np.testing.assert_allclose(sent[:, 0], 3 * sent[:, 1], atol=1e-5)
-    np.testing.assert_allclose(sent[:, 2], 0, atol=1e-7)
+    assert np.abs(sent[:, 0]).max() > tolerance("transfer.bounce.min_sent")
+    np.testing.assert_allclose(sent[:, 0], 3 * sent[:, 1], atol=tolerance("transfer.bounce.linear"))
+    np.testing.assert_allclose(sent[:, 2], 0, atol=tolerance("transfer.bounce.black"))
 
 
 def test_more_clusters_and_components_compress_less(fits):
@@ -160,7 +162,7 @@ def test_more_clusters_and_components_compress_less(fits):
     transfer = clustered(matrices, TransferSettings(clusters=8, components=6))
     rebuilt = np.einsum("tcj,tcj...->tc...", transfer.weights, transfer.basis[transfer.cluster])
     found = np.sqrt(((rebuilt - matrices) ** 2).sum() / (matrices**2).sum())
-    assert found == pytest.approx(transfer.error, rel=1e-3)
+    assert found == pytest.approx(transfer.error, rel=tolerance("transfer.codes.stated"))
 
 
 def test_bins_hold_every_triangle_of_their_clusters(fits):
@@ -178,12 +180,12 @@ def test_codes_are_half_a_step_off(rng):
     table = rng.normal(size=(3, 1, 2, 4, 2, 5, 3)).astype(np.float32)
     table[:, :, :, 1:] *= 0.01
     codes, scales = transfer_light.encoded(table)
-    assert scales[1, 0] < 0.1 * scales[0, 0]
+    assert 10 * scales[1, 0] < scales[0, 0]
     difference = np.abs(transfer_light.decoded(codes, scales) - table)
     for a, j in enumerate((slice(0, 1), slice(1, None))):
         for b, m in enumerate((slice(0, 1), slice(1, None))):
             step = scales[a, b] / transfer_light.LEVELS
-            assert difference[:, :, :, j, :, :, m].max() <= 0.5001 * step
+            assert difference[:, :, :, j, :, :, m].max() <= tolerance("transfer.codes.step") * step
 
 
 def test_a_moving_light_is_coarse_and_then_refined(fits):
@@ -205,9 +207,9 @@ def test_a_moving_light_is_coarse_and_then_refined(fits):
     with Renderer(scene, lighting=light) as renderer:
         renderer.draw()
         fresh = renderer.read()
-        np.testing.assert_allclose(refined, fresh, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(refined, fresh, rtol=SUM, atol=tolerance("rendered.sum.atol"))
     change = np.abs(fresh - first).mean()
-    assert 0 < np.abs(coarse - fresh).mean() < 0.5 * change
+    assert 0 < np.abs(coarse - fresh).mean() < tolerance("transfer.refined.coarse") * change
     plain = lighting_of(scene, "sh")
     with Renderer(scene, lighting=plain) as renderer, pytest.raises(InputError, match="transfer"):
         renderer.relight(other)
@@ -240,5 +242,7 @@ def test_other_lights_are_added_once(fits):
     options = {"environment": "transfer", "order": 2, "grid": 1, "transfer": TransferSettings(clusters=5)}
     alone, both = (realtime(s, **options).image for s in (scene, lit))
     light = realtime(replace(lit, environment=None), grid=1).image
-    assert light.max() > 0.1 * alone.max() > 0
-    np.testing.assert_allclose(both, alone + light, rtol=1e-5, atol=1e-6 * both.max())
+    assert 10 * light.max() > alone.max() > 0
+    np.testing.assert_allclose(
+        both, alone + light, rtol=SUM, atol=tolerance("rendered.sum.atol") * both.max()
+    )

@@ -235,7 +235,7 @@ def test_an_edited_png_takes_the_place_of_a_map(rng, tmp_path):
         import_maps(folder)
     (folder / "height.exr").unlink()
     again = import_maps(folder)
-    np.testing.assert_allclose(again.maps["height"], 128 / 255, rtol=1e-6)
+    np.testing.assert_allclose(again.maps["height"], 128 / 255, rtol=tolerance("gbrdf.closed_form.float32"))
     Image.fromarray(np.zeros((4, 6, 3), np.uint8)).save(folder / "diffuse.png")
     (folder / "diffuse.exr").unlink()
     with pytest.raises(InputError, match="differ in size"):
@@ -261,12 +261,12 @@ def test_photograph(rng, tmp_path):
     assert rep.maps["height"].min() == 0
     assert rep.maps["height"].max() == 1
     bright = np.unravel_index(np.argmax(luminance(picture)), (12, 10))
-    assert rep.maps["height"][bright][0] > 0.8
+    assert rep.maps["height"][bright][0] > tolerance("gbrdf.photograph.min_bright")
     # From above, without the highlight, it shows the picture.
     plain = from_photograph(tmp_path / "photo.png", depth=0.0, specular=0.0)
     v, u = (np.mgrid[0:12, 0:10] + 0.5) / np.array([12, 10])[:, None, None]
     seen = plain.evaluate(np.stack([u, v], -1), [0, 0, 1], [0, 0, 1]) * np.pi
-    np.testing.assert_allclose(seen, plain.maps["diffuse"].astype(float), atol=1e-9)
+    np.testing.assert_allclose(seen, plain.maps["diffuse"].astype(float), atol=EXACT)
 
 
 @pytest.mark.parametrize(

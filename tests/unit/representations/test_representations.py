@@ -216,7 +216,8 @@ def test_texel_stencil(filter_type, rng):
     centre = (np.stack([index % 9, index // 9], -1) + 0.5) / [9, 6]
     # Around the wrap the distance is that on the torus.
     distance = np.abs(np.mod(centre - uv[:, None] + 0.5, 1) - 0.5) * [9, 6]
-    assert distance.max() <= (0.5 if filter_type == "nearest" else 1) + tolerance("interpolation.exact.max")
+    reach = 1 / 2 if filter_type == "nearest" else 1
+    assert distance.max() <= reach + tolerance("interpolation.exact.max")
     if filter_type == "bilinear":
         np.testing.assert_allclose(
             np.prod(1 - distance, -1), weight, atol=tolerance("interpolation.exact.max")

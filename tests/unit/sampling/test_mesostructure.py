@@ -68,7 +68,7 @@ def test_checker_height_is_periodic_and_smooth():
         2 * step
     )
     assert np.abs(numeric - slope_y).max() <= tolerance("mesostructure.slope")
-    assert height.min() >= -0.2
+    assert height.min() >= -options["amplitude"]
     assert height.max() <= 0
 
 

@@ -40,7 +40,7 @@ def test_rings_are_closed_and_apart(count):
     low, high = radius.min(1), radius.max(1)
     assert (low[1:] > high[:-1]).all()
     assert 0 < low[0]
-    assert high[-1] < 0.5
+    assert 2 * high[-1] < 1
     assert z.max() == 0.0
     assert z.min() > base.vertices[:, 2].max()
     assert gold.bsdf["type"] == "roughconductor"

@@ -81,7 +81,7 @@ def test_an_exr_holds_heights_as_they_are(tmp_path):
     heights = 3 * _waves(16) - 7
     low, high = build(_exr(tmp_path / "h.exr", heights), amplitude=0.1).height
     assert high == 0
-    assert low == pytest.approx(0.1 * (heights.min() - heights.max()), rel=1e-6)
+    assert low == pytest.approx(0.1 * (heights.min() - heights.max()), rel=tolerance("metric.float32.rtol"))
 
 
 def test_a_height_map_with_a_seam_is_refused(tmp_path):
@@ -262,7 +262,9 @@ def test_a_tile_of_a_larger_mesh_in_other_units(tmp_path):
         build(file)
     for tile in ((10, -30, 50, 10), "bounds"):
         got = build(file, tile=tile)
-        assert got.parts[0].vertices == pytest.approx(vertices - [0, 0, vertices[:, 2].max()], abs=1e-7)
+        assert got.parts[0].vertices == pytest.approx(
+            vertices - [0, 0, vertices[:, 2].max()], abs=tolerance("mesostructure.units")
+        )
     with pytest.raises(InputError, match="a square"):
         build(file, tile=(10, -30, 50, 9))
 
@@ -286,7 +288,7 @@ def test_borders_that_meet_have_no_seam():
 def test_a_gap_is_measured_and_placed():
     vertices, faces = _grid(10, lambda x, y: 0.03 * x * np.exp(-8 * np.sin(np.pi * (y - 0.3)) ** 2))
     (seam,) = mesh_seams(vertices, faces)
-    assert seam.gap == pytest.approx(0.03, rel=1e-3)
+    assert seam.gap == pytest.approx(0.03, rel=tolerance("mesostructure.gap"))
     assert "x = 0 and x = 1" in seam.what
     assert "y = 0.3" in seam.what
 

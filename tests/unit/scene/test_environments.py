@@ -19,7 +19,9 @@ def test_shipped_by_name(fits, name):
     shipped = environments.shipped(name)
     np.testing.assert_array_equal(found.radiance, shipped.radiance)
     if name != "constant":
-        np.testing.assert_allclose(found.to_world, shipped.to_world, atol=1e-6)
+        np.testing.assert_allclose(
+            found.to_world, shipped.to_world, atol=tolerance("environment.shipped.max_abs")
+        )
 
 
 def test_sky_by_elevation(need):
@@ -27,16 +29,24 @@ def test_sky_by_elevation(need):
     for name, elevation in (("sky", environments.ELEVATION), ("sky60", 60)):
         w, power = environments.shipped(name).cells()
         sun = w[power.sum(1).argmax()]
-        assert np.degrees(np.arcsin(sun[2])) == pytest.approx(elevation, abs=1)
-        assert np.degrees(np.arctan2(sun[1], sun[0])) == pytest.approx(environments.AZIMUTH, abs=1.5)
+        assert np.degrees(np.arcsin(sun[2])) == pytest.approx(
+            elevation, abs=tolerance("environment.sun.elevation")
+        )
+        assert np.degrees(np.arctan2(sun[1], sun[0])) == pytest.approx(
+            environments.AZIMUTH, abs=tolerance("environment.sun.azimuth")
+        )
 
 
 def test_soft_boxes_are_where_they_are_said_to_be():
     studio = environments.shipped("studio")
     for centre, _, _, radiance in environments.SOFTBOXES:
         towards = np.array(centre) / np.linalg.norm(centre)
-        np.testing.assert_allclose(studio.evaluate(towards), radiance, rtol=1e-6)
-    np.testing.assert_allclose(studio.evaluate([0, 0, -1.0]), environments.FLOOR, rtol=1e-6)
+        np.testing.assert_allclose(
+            studio.evaluate(towards), radiance, rtol=tolerance("environment.shipped.rtol")
+        )
+    np.testing.assert_allclose(
+        studio.evaluate([0, 0, -1.0]), environments.FLOOR, rtol=tolerance("environment.shipped.rtol")
+    )
 
 
 def test_the_random_environment_is_its_formula(rng):

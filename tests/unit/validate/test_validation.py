@@ -14,6 +14,7 @@ from btfref import provenance as caching
 from btfref.comparison.waterfall import Picture, waterfall
 from btfref.conventions import PixelClass
 from btfref.errors import InputError
+from btfref.gates import tolerance
 from btfref.images.display import Display
 from btfref.provenance import code_of, method_files
 from btfref.registry import Method, methods
@@ -120,7 +121,9 @@ def test_a_missing_reference_fails_every_gate():
 
 def test_eight_bits_are_what_a_display_shows():
     display = Display(1.0)
-    assert eight_bits(np.array([0.0, 0.5, 7.0]), display) == pytest.approx([0, 0.5, 0.5], abs=1e-6)
+    assert eight_bits(np.array([0.0, 0.5, 7.0]), display) == pytest.approx(
+        [0, 0.5, 0.5], abs=tolerance("report.eight_bits")
+    )
     shown = eight_bits(np.linspace(0, 0.75, 20001), display)
     assert len(np.unique(shown)) == 256
 
@@ -130,9 +133,9 @@ def test_a_picture_that_is_nearly_another_costs_little(rng):
     image = reference * (1 + 1e-6 * rng.normal(size=reference.shape))
     alone, beside = pack(image, bits=6), pack(image, bits=6, base=("reference", reference))
     assert beside["base"] == "reference"
-    assert len(beside["data"]) < 0.05 * len(alone["data"])
+    assert len(beside["data"]) < tolerance("report.beside.share") * len(alone["data"])
     packed = pack(reference, bits=6)
-    np.testing.assert_allclose(unpack(beside, packed), image, rtol=2**-6)
+    np.testing.assert_allclose(unpack(beside, packed), image, rtol=tolerance("report.beside.rtol"))
     assert "base" not in pack(5 * image, base=("reference", reference))
 
 
