@@ -146,13 +146,13 @@ def test_a_literal_limit_is_found(line):
 @pytest.mark.parametrize(
     "line",
     [
-        "assert error <= tolerance('a.b')",
-        "assert error <= target * (1 + tolerance('a.b'))",
-        "assert np.quantile(error, 0.99) < tolerance('a.b')",
+        "assert error <= tolerance('fit.stated.max')",
+        "assert error <= target * (1 + tolerance('fit.stated.max'))",
+        "assert np.quantile(error, 0.99) < tolerance('fit.stated.max')",
         "assert f(0.5) == 0.25",
         "assert n > 3",
-        "assert 9 * size <= 1e6 * tolerance('a.b')",
-        "np.testing.assert_allclose(a, 0.5, rtol=0, atol=tolerance('a.b'))",
+        "assert 9 * size <= 1e6 * tolerance('fit.stated.max')",
+        "np.testing.assert_allclose(a, 0.5, rtol=0, atol=tolerance('fit.stated.max'))",
         "np.testing.assert_allclose(a, b, atol=n**2 * EXACT)",
         "assert a == pytest.approx(0.5)",
     ],
