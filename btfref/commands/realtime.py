@@ -26,7 +26,7 @@ from btfref.commands.shared.options import (
 from btfref.commands.shared.printing import emit, emit_json
 from btfref.commands.shared.reading import assignments, count, output_file
 from btfref.errors import InputError
-from btfref.rendering.environment_light.ways import PATHS
+from btfref.rendering.environment_light import PATHS
 
 if TYPE_CHECKING:
     from btfref.rendering.environment_light.transfer import TransferSettings

@@ -239,10 +239,6 @@ def sunsky(*, shape=(256, 512), turbidity=3.0, sun_direction=(0.4, 0.3, 0.86), u
     return Environment(sky.astype(np.float32), to_world, "sunsky")
 
 
-#: Environments that are made instead of loaded, by name.
-CONSTRUCTED = {"constant": constant, "bright_texel": bright_texel, "sunsky": sunsky}
-
-
 def from_emitter(kind, emitter, types, *, file=None):
     """The environment of a Mitsuba emitter, asked of the emitter itself.
 

@@ -14,7 +14,7 @@ from btfref.comparison.waterfall import Picture, waterfall
 from btfref.conventions import PixelClass
 from btfref.errors import BtfrefError
 from btfref.gates.verdicts import GateResult, missing_reference
-from btfref.images.display import Display, fit_display
+from btfref.images.display import fit_display
 from btfref.numerics.colour import decode_srgb
 from btfref.provenance import code_of
 from btfref.scene.shipped import scene_file
@@ -275,8 +275,3 @@ def sampling_noise(views, mask):
     a, b = (views.sampled[0] - views.truth[0])[mask], (views.twin - views.truth[1])[mask]
     noise = 0.5 * np.mean((views.sampled[0] - views.twin)[mask].astype(float) ** 2)
     return {"mse": float(np.mean(a * b, dtype=float)), "noise": float(noise)}
-
-
-def restored_display(facts):
-    """The display of a cell's waterfall."""
-    return Display(facts["waterfall"]["display"]["stops"])

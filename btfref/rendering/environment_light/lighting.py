@@ -16,7 +16,7 @@ import numpy as np
 from btfref.errors import InputError
 from btfref.numerics.sphere import harmonics
 from btfref.registry import image_light, methods
-from btfref.rendering.environment_light import harmonic_light, transfer_light
+from btfref.rendering.environment_light import PATHS, harmonic_light, transfer_light
 from btfref.rendering.environment_light.light_set import light_set
 from btfref.rendering.environment_light.transfer import (
     TransferSettings,
@@ -24,7 +24,6 @@ from btfref.rendering.environment_light.transfer import (
     corner_matrices,
     vertex_transfer,
 )
-from btfref.rendering.environment_light.ways import PATHS
 from btfref.scene.environment import constant
 from btfref.scene.shapes import neighbours
 

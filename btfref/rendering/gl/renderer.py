@@ -14,6 +14,7 @@ import numpy as np
 
 from btfref import representations
 from btfref.errors import BtfrefError, InputError
+from btfref.rendering import RenderResult
 from btfref.rendering.environment_light.lighting import lighting_of
 from btfref.rendering.gl import device
 from btfref.rendering.gl.raster import (
@@ -23,7 +24,6 @@ from btfref.rendering.gl.raster import (
     triangle_table,
     world_to_clip,
 )
-from btfref.rendering.result import RenderResult
 from btfref.scene.demand import MARGIN, kept_maps, number_kept
 from btfref.scene.description import SceneDescription, read_scene
 

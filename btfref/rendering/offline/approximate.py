@@ -13,8 +13,8 @@ import numpy as np
 from btfref import representations
 from btfref.errors import InputError
 from btfref.numerics.footprint import ANISOTROPY, probe_weight
+from btfref.rendering import RenderResult
 from btfref.rendering.environment_light.lighting import lighting_of
-from btfref.rendering.result import RenderResult
 from btfref.representations.protocol import HasLevels
 from btfref.scene.description import read_scene
 from btfref.scene.hits import Hits, surfaces

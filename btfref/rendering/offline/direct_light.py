@@ -1,10 +1,14 @@
-"""Direct light by Monte Carlo, with or without cast shadows: the reference of real-time pictures under environments."""
+"""Direct light, with or without cast shadows: by Monte Carlo, and on a regular grid, noise-free where lights allow."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from btfref.errors import InputError
+from btfref.rendering import RenderResult
 from btfref.scene.camera import film_rays, grid_offsets
+from btfref.scene.lights import distant_or_delta, is_delta
+from btfref.types import Facts, JitArray
 
 #: Camera rays times samples that are traced at a time.
 LANES = 1 << 22
@@ -17,6 +21,47 @@ ROUNDS = 4
 STEPS = tuple(
     round(2**32 * root**-k) for root, d in ((1.324717957, 2), (1.220744085, 3)) for k in range(1, d + 1)
 )
+
+
+def on_grid(
+    scene: JitArray, grid: int, spp: int, seed: int, shadows: bool, *, random: bool = False
+) -> RenderResult:
+    """Direct light at the regular sub-pixel positions of a grid.
+
+    Parameters
+    ----------
+    scene : mitsuba.Scene
+    grid : int
+        n of n × n.
+    spp : int
+        Samples a pixel where directions of the light are random.
+    seed : int
+    shadows : bool
+    random : bool
+        Take random lights even where all are delta lights, for a variance.
+
+    Returns
+    -------
+    RenderResult
+        Without variance and independent pictures where nothing is random.
+
+    Raises
+    ------
+    InputError
+        For an area light, or a variant that is none of a JIT.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    if not dr.is_jit_v(mi.Float):
+        raise InputError("a regular grid needs a JIT variant", field="variant", got=mi.variant())
+    settings: Facts = {"grid": grid, "shadows": shadows}
+    if all(is_delta(emitter) for emitter in distant_or_delta(scene)) and not random:
+        settings["integrator"] = "noise-free direct"
+        return RenderResult(noise_free(scene, grid, shadows), None, settings)
+    pictures, variance, spp = regular(scene, grid, spp, seed, shadows)
+    settings |= {"spp": spp, "seed": seed, "integrator": "direct"}
+    return RenderResult(pictures.mean(0), variance, settings, pictures)
 
 
 def make_integrator(shadows):
@@ -164,3 +209,41 @@ def regular(scene, grid, spp, seed, shadows):
     pictures = batches.reshape(ROUNDS, 3, height, width).transpose(0, 2, 3, 1).astype(np.float32)
     variance = variance.T.reshape(height, width, 3).astype(np.float32)
     return pictures, variance, rounds * step * grid**2
+
+
+def noise_free(scene, n, shadows):
+    """Mean over the n × n grid of Σ over delta lights of incident power × ``bsdf.eval``; float32 (H, W, 3)."""
+    sensor = scene.sensors()[0]
+    width, height = (int(k) for k in sensor.film().crop_size())
+    total = np.zeros((3, width * height))
+    for offset in grid_offsets(n):
+        ray, weight = film_rays(sensor, offset)
+        total += np.array(weight * _exact(scene, ray, shadows), float)
+    return (total.T / n**2).reshape(height, width, 3).astype(np.float32)
+
+
+def _exact(scene, ray, shadows):
+    """Radiance along camera rays: Σ over delta lights of incident power × ``bsdf.eval``."""
+    import drjit as dr
+    import mitsuba as mi
+
+    si = scene.ray_intersect(ray)
+    bsdf = si.bsdf(ray)
+    context = mi.BSDFContext()
+    emitters = scene.emitters_dr()
+
+    def body(i, sum_):
+        emitter = dr.gather(mi.EmitterPtr, emitters, i, si.is_valid())
+        sample, power = emitter.sample_direction(si, mi.Point2f(0.5), si.is_valid())
+        active = si.is_valid() & (sample.pdf > 0)
+        local = si.to_local(sample.d)
+        # What only reflects is black under a light behind it: no shadow ray and no lookup.
+        active &= (local.z * si.wi.z > 0) | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
+        if shadows:
+            active &= ~scene.ray_test(si.spawn_ray_to(sample.p), active)
+        value = bsdf.eval(context, si, local, active)
+        return i + 1, sum_ + dr.select(active, power * value, 0)
+
+    count = len(scene.emitters())
+    start = dr.zeros(mi.UInt32, dr.width(ray)), dr.zeros(mi.Spectrum, dr.width(ray))
+    return dr.while_loop(start, lambda i, _: i < count, body, labels=("light", "radiance"))[1]

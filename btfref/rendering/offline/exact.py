@@ -14,7 +14,7 @@ import time
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.rendering.result import RenderResult
+from btfref.rendering import RenderResult
 from btfref.scene.camera import film_rays
 from btfref.scene.description import read_scene
 from btfref.scene.hits import Hits

@@ -12,7 +12,7 @@ import numpy as np
 
 from btfref.conventions import PixelClass
 from btfref.errors import InputError
-from btfref.rendering.result import RenderResult
+from btfref.rendering import RenderResult
 from btfref.scene.description import read_scene
 
 #: Independent renders that a picture is the mean of; their spread gives the variance.

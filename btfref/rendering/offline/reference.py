@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 
 from btfref.errors import BtfrefError, InputError
-from btfref.rendering.result import RenderResult
+from btfref.rendering import RenderResult
+from btfref.rendering.offline.direct_light import make_integrator, on_grid
 from btfref.sampling.variant import no_collection
-from btfref.scene.camera import film_rays, grid_offsets, tell_camera
+from btfref.scene.camera import tell_camera
 from btfref.scene.demand import MARGIN, kept_maps, number_kept
-from btfref.scene.lights import distant_or_delta, is_delta
 from btfref.scene.loading import loaded
+from btfref.types import Facts
 
 #: Independent renders whose spread gives the variance of the mean: 15 degrees of freedom.
 BATCHES = 16
@@ -115,42 +117,35 @@ def traced(made, *, spp=None, seed=0, grid=None, shadows=True, with_variance=Fal
     """
     import mitsuba as mi
 
-    spp = spp or _sample_count(made)
-    tell_camera(made, 1 / (grid or spp**0.5))
-    start, pictures = time.perf_counter(), None
-    if grid is None:
-        image, variance, settings = _monte_carlo(made, spp, seed, with_variance, shadows)
-    elif _all_delta(made) and not with_variance:
-        image, variance = _noise_free(made, grid, shadows), None
-        settings = {"grid": grid, "shadows": shadows, "integrator": "noise-free direct"}
-    else:
-        from btfref.rendering.offline.direct_light import regular
+    from btfref.provenance import versions
 
-        pictures, variance, spp = regular(made, grid, spp, seed, shadows)
-        image = pictures.mean(0)
-        settings = {"grid": grid, "spp": spp, "seed": seed, "shadows": shadows, "integrator": "direct"}
+    spp = spp or int(made.sensors()[0].sampler().sample_count())
+    tell_camera(made, 1 / (grid or spp**0.5))
+    start = time.perf_counter()
+    if grid is None:
+        found = _monte_carlo(made, spp, seed, with_variance, shadows)
+    else:
+        found = on_grid(made, grid, spp, seed, shadows, random=with_variance)
     facts = {
         "renderer": "mitsuba",
         "variant": mi.variant(),
         "rfilter": "box",
         "component_format": "float32",
-        **settings,
-        "not_finite": int(np.count_nonzero(~np.isfinite(image))),
+        **found.meta,
+        "not_finite": int(np.count_nonzero(~np.isfinite(found.image))),
         "seconds": time.perf_counter() - start,
-        **_versions(),
+        "versions": versions(),
     }
-    return RenderResult(image, variance, facts, pictures)
+    return replace(found, meta=facts)
 
 
 def _monte_carlo(scene, spp, seed, with_variance, shadows):
     import mitsuba as mi
 
-    from btfref.rendering.offline.direct_light import make_integrator
-
     integrator = scene.integrator() if shadows else make_integrator(shadows=False)
     if integrator is None:
         raise InputError("the scene has no integrator", field="integrator", expected="such as path")
-    settings = {
+    settings: Facts = {
         "seed": seed,
         "integrator": integrator.class_name() if hasattr(integrator, "class_name") else "",
         "shadows": shadows,
@@ -160,7 +155,7 @@ def _monte_carlo(scene, spp, seed, with_variance, shadows):
         return np.array(mi.render(scene, integrator=integrator, spp=count, seed=number), np.float32)[..., :3]
 
     if not with_variance:
-        return once(spp, seed), None, {**settings, "spp": spp}
+        return RenderResult(once(spp, seed), None, {**settings, "spp": spp})
     if spp < 2:
         raise InputError("a variance needs two samples per pixel", field="spp", got=spp, expected="≥ 2")
     batches = min(BATCHES, spp)
@@ -174,68 +169,5 @@ def _monte_carlo(scene, spp, seed, with_variance, shadows):
         mean = mean + change / (done + 1)
         square = square + change * (image - mean)
     variance = (square / (batches - 1) / batches).astype(np.float32)
-    return mean.astype(np.float32), variance, {**settings, "spp": count * batches, "batches": batches}
-
-
-def _sample_count(scene):
-    return int(scene.sensors()[0].sampler().sample_count())
-
-
-def _all_delta(scene):
-    """Whether a regular grid needs no random number.
-
-    Raises
-    ------
-    InputError
-        For lights or a variant that a regular grid does not have.
-    """
-    import drjit as dr
-    import mitsuba as mi
-
-    if not dr.is_jit_v(mi.Float):
-        raise InputError("a regular grid needs a JIT variant", field="variant", got=mi.variant())
-    return all(is_delta(emitter) for emitter in distant_or_delta(scene))
-
-
-def _noise_free(scene, n, shadows):
-    """Mean over the grid of Σ over lights of incident power × ``bsdf.eval``; float32 (H, W, 3)."""
-    sensor = scene.sensors()[0]
-    width, height = (int(k) for k in sensor.film().crop_size())
-    total = np.zeros((3, width * height))
-    for offset in grid_offsets(n):
-        ray, weight = film_rays(sensor, offset)
-        total += np.array(weight * direct(scene, ray, shadows), float)
-    return (total.T / n**2).reshape(height, width, 3).astype(np.float32)
-
-
-def direct(scene, ray, shadows):
-    """Radiance along camera rays: Σ over delta lights of incident power × ``bsdf.eval``."""
-    import drjit as dr
-    import mitsuba as mi
-
-    si = scene.ray_intersect(ray)
-    bsdf = si.bsdf(ray)
-    context = mi.BSDFContext()
-    emitters = scene.emitters_dr()
-
-    def body(i, sum_):
-        emitter = dr.gather(mi.EmitterPtr, emitters, i, si.is_valid())
-        sample, power = emitter.sample_direction(si, mi.Point2f(0.5), si.is_valid())
-        active = si.is_valid() & (sample.pdf > 0)
-        local = si.to_local(sample.d)
-        # What only reflects is black under a light behind it: no shadow ray and no lookup.
-        active &= (local.z * si.wi.z > 0) | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
-        if shadows:
-            active &= ~scene.ray_test(si.spawn_ray_to(sample.p), active)
-        value = bsdf.eval(context, si, local, active)
-        return i + 1, sum_ + dr.select(active, power * value, 0)
-
-    count = len(scene.emitters())
-    start = dr.zeros(mi.UInt32, dr.width(ray)), dr.zeros(mi.Spectrum, dr.width(ray))
-    return dr.while_loop(start, lambda i, _: i < count, body, labels=("light", "radiance"))[1]
-
-
-def _versions():
-    from btfref.provenance import versions
-
-    return {"versions": versions()}
+    settings |= {"spp": count * batches, "batches": batches}
+    return RenderResult(mean.astype(np.float32), variance, settings)
