@@ -34,6 +34,9 @@ BLOCK = 64
 #: Values of the axis' height above the horizon, from −1 to 1, in a table of clipped lobes.
 HEIGHTS = 128
 
+#: The square of what is smaller is no normal number: such numbers are slow, and NumPy calls them underflow.
+SMALLEST = 1.5e-154
+
 
 def exponents(slices=SLICES):
     """The sampled exponents ``2^(i/2)``, shape (slices,)."""
@@ -181,12 +184,18 @@ def clipped_lobes(edge, *, cosine, slices=CLIPPED, heights=HEIGHTS):
     weight = weight * np.where(z < edge, z / max(edge, 1e-30), 1) * (held if cosine else 1)
     a = np.linspace(-1, 1, heights)[:, None, None]
     product = radius[:, None] * np.sqrt(1 - a * a) * np.cos(phi) + held[:, None] * a
-    log = np.log(np.maximum(product, FLOOR))
+    # Means over the azimuth of a lobe, and of it times cos φ.
+    means = np.stack([np.ones_like(phi), np.cos(phi)], 1) / len(phi)
+    # Every second exponent is twice the one before: squares, and one power for each parity.
+    product = np.where(product > FLOOR, product, 0)
+    chain = [product, product ** np.sqrt(2)]
     horizontal = np.sqrt(1 - a.ravel() ** 2)
     result = np.zeros((slices, heights, 4))
     for i, n in enumerate(exponents(slices)):
-        lobe = np.where(product > FLOOR, np.exp(n * log), 0)
-        total, along = lobe.mean(-1), (lobe * np.cos(phi)).mean(-1)
+        total, along = np.moveaxis(chain[i % 2] @ means, -1, 0)
+        if i + 2 < slices:
+            chain[i % 2][chain[i % 2] < SMALLEST] = 0
+            np.multiply(chain[i % 2], chain[i % 2], out=chain[i % 2])
         integral = total @ weight
         up, across = total @ (weight * z), along @ (weight * np.sqrt(1 - z * z))
         length = np.hypot(up, across)

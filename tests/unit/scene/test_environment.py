@@ -89,7 +89,7 @@ def test_lobes_of_a_sky_are_its_integrals(rng):
     environment = sky(rng)
     w, weight = sphere()
     radiance = environment.evaluate(w) * weight[:, None]
-    maps = prefilter.lobe_maps(environment)
+    maps = prefilter.lobe_maps(environment, **SMALL)
     axis = random_directions(rng, 30)
     for i in (0, 3, 10):
         n = prefilter.exponents()[i]
@@ -100,7 +100,7 @@ def test_lobes_of_a_sky_are_its_integrals(rng):
 
 def test_moments_of_a_constant_environment(rng):
     """Over a hemisphere about n: ∫ l l dω = 2π/3 I and ∫ l dω = π n."""
-    maps = prefilter.moment_maps(constant(), 0.0)
+    maps = prefilter.moment_maps(constant(), 0.0, **SMALL)
     n = random_directions(rng, 500)
     found = np.stack([prefilter.map_lookup(maps, np.full(len(n), i), n)[:, 0] for i in range(9)], 1)
     limit = tolerance("environment.moments.max")
