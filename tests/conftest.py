@@ -127,6 +127,13 @@ def llvm(need):
     _free()
 
 
+@pytest.fixture(scope="session")
+def renderers(need):
+    """Both renderers can run here: Mitsuba on LLVM, and OpenGL."""
+    need("llvm")
+    need("gl")
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _free_jit_state():
     """No array of one test module keeps memory, or leaves pending work, for the next."""

@@ -14,15 +14,11 @@ from btfref.rendering.offline.reference import render
 from btfref.scene.description import read_scene
 from btfref.scene.pixel_classes import pixel_classes
 
+pytestmark = pytest.mark.usefixtures("renderers")
+
 GRID = 4
 SIZE = (96, 96)
 GATES = ("image.noise_free", "image.silhouette", "image.background")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _renderers(need):
-    need("llvm")
-    need("gl")
 
 
 def save_fitted(directory, key, **settings):

@@ -16,6 +16,8 @@ from btfref.rendering.offline.reference import render
 from btfref.representations import save
 from btfref.scene.pixel_classes import pixel_classes
 
+pytestmark = pytest.mark.usefixtures("renderers")
+
 GATES = ("image.noise_free", "image.silhouette", "image.mesostructure", "image.background")
 
 SCENES = ("plane", "sphere", "cloth")
@@ -40,12 +42,6 @@ SETTINGS = {
     "hf": {"clusters": 32, "smoothness": 1.0},
     "gbrdf": {"pairs": 32, "layers": 16, "materials": 2},
 }
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _renderers(need):
-    need("llvm")
-    need("gl")
 
 
 @pytest.fixture(scope="module")

@@ -19,13 +19,9 @@ from btfref.scene.shipped import scene_file
 from btfref.testing import assert_matches_reference
 from btfref.validate.own_renderer import Reference, judge_image, reference_of, representation_for
 
+pytestmark = pytest.mark.usefixtures("renderers")
+
 SIZE = (48, 48)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _renderers(need):
-    need("llvm")
-    need("gl")
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,7 @@ from btfref.gates import tolerance
 from btfref.validate.faults import FAULTS
 from btfref.validate.self_test import entries, self_test, used_gates
 
-
-@pytest.fixture(autouse=True)
-def _renderers(need):
-    need("llvm")
-    need("gl")
+pytestmark = pytest.mark.usefixtures("renderers")
 
 
 def test_every_gate_has_a_fault():

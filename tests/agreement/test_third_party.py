@@ -10,15 +10,11 @@ from pathlib import Path
 import pytest
 from oracle import oracle_btf
 
+pytestmark = pytest.mark.usefixtures("renderers")
+
 EXAMPLE = Path(__file__).parents[1] / "third_party" / "tinted_brdf"
 KEY = "tinted_brdf"
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _renderers(need):
-    need("llvm")
-    need("gl")
 
 
 @pytest.fixture(scope="module")

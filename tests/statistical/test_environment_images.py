@@ -22,6 +22,8 @@ from btfref.scene.loading import loaded
 from btfref.scene.pixel_classes import pixel_classes
 from btfref.scene.shipped import scene_file
 
+pytestmark = pytest.mark.usefixtures("renderers")
+
 SCENES = ("plane", "sphere", "cloth")
 ENVIRONMENTS = ("constant", "sky", "studio", "bright-texel")
 GATES = {
@@ -36,11 +38,6 @@ QUICK = {
     ("rf_poly", "plane", "bright-texel"),
     ("rf_lobes", "sphere", "bright-texel"),
 }
-
-
-@pytest.fixture(autouse=True)
-def _renderers(need):
-    need("llvm"), need("gl")
 
 
 def cell(key, scene, environment):

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from stores import contents
 
 from btfref.cli import main
 from btfref.errors import InputError, MissingDependencyError
@@ -17,10 +18,6 @@ from btfref.sampling.synthesis import synthesize_store
 pytestmark = pytest.mark.usefixtures("llvm")
 
 SETTINGS = {"texels": 16, "views": "3x4", "lights": "2x4", "spp": 8, "seed": 5, "resolution": 16}
-
-
-def _files(root):
-    return {str(p.relative_to(root)): p.read_bytes() for p in Path(root).rglob("*") if p.is_file()}
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +50,7 @@ def test_workers_write_the_same_bytes(tmp_path, cluster, extra):
     synthesize_store(
         shared, "checker", scheduler=cluster, progress=lambda *call: calls.append(call), **SETTINGS, **extra
     )
-    assert _files(alone) == _files(shared)
+    assert contents(alone) == contents(shared)
     assert calls[-1] == (12, 12, "synthesis")
     assert sorted(os.listdir(tmp_path)) == ["alone.btf.zarr", "shared.btf.zarr"]
 
@@ -67,7 +64,7 @@ def test_the_number_of_workers_changes_no_byte(need, tmp_path, workers):
     settings = SETTINGS | {"estimator": "surface"}
     synthesize_store(alone, "checker", **settings)
     synthesize_store(shared, "checker", scheduler="dask", workers=workers, **settings)
-    assert _files(alone) == _files(shared)
+    assert contents(alone) == contents(shared)
 
 
 @pytest.mark.filterwarnings("default")
@@ -80,7 +77,7 @@ def test_a_cluster_that_runs_elsewhere_is_reached_by_its_address(tmp_path, clust
     command += ["--spp", "4", "--estimator", "surface", "--scheduler", address]
     before = cluster.run(os.getpid)
     assert main(command) == 0
-    assert _files(alone) == _files(shared)
+    assert contents(alone) == contents(shared)
     # The cluster is somebody else's: it goes on.
     assert cluster.run(os.getpid) == before
 
@@ -97,7 +94,7 @@ def test_a_killed_worker_loses_nothing(tmp_path, cluster):
             os.kill(next(iter(before.values())), signal.SIGKILL)
 
     synthesize_store(shared, "checker", scheduler=cluster, progress=kill, **settings)
-    assert _files(alone) == _files(shared)
+    assert contents(alone) == contents(shared)
     cluster.wait_for_workers(2, timeout=60)
     assert set(cluster.run(os.getpid).values()) != set(before.values())
 

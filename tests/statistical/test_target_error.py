@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from stores import contents
 
 from btfref.comparison.significance import welch_test
 from btfref.errors import InputError
@@ -27,10 +28,6 @@ def tile():
         bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [rho] * 3}}
         parts.append(Part(part.vertices, part.faces, bsdf, normals=part.normals))
     return Mesostructure("squares", {}, tuple(parts))
-
-
-def _files(root):
-    return {str(p.relative_to(root)): p.read_bytes() for p in root.rglob("*") if p.is_file()}
 
 
 @pytest.mark.parametrize(("estimator", "target"), [("path", 0.01), ("surface", 0.025)])
@@ -103,7 +100,7 @@ def test_same_bytes_in_one_go_in_parts_and_in_small_blocks(tmp_path, tile, estim
     seen = []
     synthesize_store(parts, tile, progress=lambda *call: seen.append(call), **settings)
     assert seen == [(k, 8, "synthesis") for k in range(3, 9)]  # the pilot was kept
-    assert _files(whole) == _files(parts)
+    assert contents(whole) == contents(parts)
     memory = synthesize(tile, **settings)
     assert np.array_equal(memory.values, SampledBTF.load(whole).values)
 
@@ -134,7 +131,7 @@ def test_tiles_are_resumed(tmp_path, tile, monkeypatch):
     assert open_store(killed).coverage[0, 0].sum() == 5
     synthesize_store(killed, tile, **settings)
     assert len(calls) == 6
-    assert _files(tmp_path / "whole.btf.zarr") == _files(killed)
+    assert contents(tmp_path / "whole.btf.zarr") == contents(killed)
 
 
 def test_an_allocation_meets_its_prediction():

@@ -19,6 +19,8 @@ from btfref.rendering.offline.approximate import approximate
 from btfref.scene.pixel_classes import pixel_classes
 from btfref.scene.shipped import scene_file
 
+pytestmark = pytest.mark.usefixtures("renderers")
+
 SIZE = (20, 20)
 SCENES = ("plane", "sphere", "cloth")
 
@@ -46,11 +48,6 @@ CELLS = [
     for key in methods()
     for scene in SCENES
 ]
-
-
-@pytest.fixture(autouse=True)
-def _renderers(need):
-    need("llvm"), need("gl")
 
 
 def albedo(every, nodes, uv, w_view, to_world, evaluate=None, place=None):

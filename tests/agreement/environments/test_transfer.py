@@ -28,13 +28,10 @@ from btfref.scene.pixel_classes import pixel_classes
 from btfref.scene.shapes import neighbours
 from btfref.scene.shipped import scene_file
 
+pytestmark = pytest.mark.usefixtures("renderers")
+
 SIZE = (32, 32)
 SUM = tolerance("rendered.sum.rtol")
-
-
-@pytest.fixture(autouse=True)
-def _renderers(need):
-    need("llvm"), need("gl")
 
 
 def parameters(fits, environment="harmonics", **more):

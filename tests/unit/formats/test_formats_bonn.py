@@ -5,6 +5,7 @@ import struct
 import formats_material as material
 import numpy as np
 import pytest
+from stores import imported
 
 from btfref.errors import InputError
 from btfref.formats import export_btf, identify, import_btf, open_source
@@ -21,11 +22,6 @@ def written(tmp_path, data, name="x.btf"):
     path = tmp_path / name
     path.write_bytes(data)
     return path
-
-
-def imported(path, **settings):
-    out = path.with_name(path.name + ".btf.zarr")
-    return SampledBTF.load(import_btf(path, out, dtype="float32", **settings).path)
 
 
 def check(btf, expected, gate=FLOAT):

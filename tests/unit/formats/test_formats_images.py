@@ -11,6 +11,7 @@ import formats_material as material
 import numpy as np
 import pytest
 from PIL import Image
+from stores import imported
 
 from btfref.errors import InputError
 from btfref.formats import export_btf, identify, import_btf, open_source
@@ -78,11 +79,6 @@ def xyz(colours):
     return dict(zip("XYZ", np.moveaxis(colours @ RGB_TO_XYZ.T * 100, -1, 0), strict=True))
 
 
-def load(path, out=None, **settings):
-    out = out or path.with_name(path.name + ".btf.zarr")
-    return SampledBTF.load(import_btf(path, out, dtype="float32", **settings).path)
-
-
 def codes(values):
     return np.round(np.clip(values, 0, 1) * 255) / 255
 
@@ -93,8 +89,8 @@ def test_ubo(zipped, tmp_path):
     path = folder(tmp_path / "ubo", values=values)
     path = archive(tmp_path / "ubo.zip", path) if zipped else path
     assert identify(path) == "ubo"
-    np.testing.assert_allclose(load(path).values, material.stored(codes(values) ** 2.2), rtol=DECODED)
-    other = load(path, tmp_path / "other.btf.zarr", gamma=1.0, cosine="excluded", scale=0.5)
+    np.testing.assert_allclose(imported(path).values, material.stored(codes(values) ** 2.2), rtol=DECODED)
+    other = imported(path, tmp_path / "other.btf.zarr", gamma=1.0, cosine="excluded", scale=0.5)
     expected = material.stored(codes(values), cosine_included=False, scale=0.5)
     np.testing.assert_allclose(other.values, expected, rtol=DECODED)
 
@@ -105,9 +101,9 @@ def test_utia(tmp_path):
     path = folder(tmp_path / "png", utia_name, values=values / 2)
     assert identify(path) == "utia"
     expected = material.stored(decode_srgb(codes(values / 2)), cosine_included=False, scale=1 / np.pi)
-    np.testing.assert_allclose(load(path).values, expected, rtol=DECODED)
+    np.testing.assert_allclose(imported(path).values, expected, rtol=DECODED)
     path = folder(tmp_path / "exr", lambda *pair: utia_name(*pair, end="exr"), exr(xyz), values)
-    found = load(path).values
+    found = imported(path).values
     expected = material.stored(values, cosine_included=False, scale=1 / np.pi)
     assert np.abs(found - expected).max() <= tolerance("formats.half_xyz.max") * expected.max()
     assert found.max() > 1 / np.pi  # reflectance above 1 survives
@@ -116,7 +112,7 @@ def test_utia(tmp_path):
 def test_colours_outside_the_gamut_keep_their_negative_channel(tmp_path):
     green = np.broadcast_to([-0.25, 0.5, 0.0], (5, 5, 2, 2, 3))
     path = folder(tmp_path / "exr", lambda *pair: utia_name(*pair, end="exr"), exr(xyz), green)
-    assert load(path).values[0, 0, 0, 0, 0] == pytest.approx(
+    assert imported(path).values[0, 0, 0, 0, 0] == pytest.approx(
         -0.25 / np.pi, rel=tolerance("formats.half_negative.rtol")
     )
 
@@ -132,13 +128,13 @@ def test_spectral(tmp_path):
     path = folder(tmp_path / "s", spectral_name, exr(planes), values)
     assert identify(path) == "spectral"
     expected = material.stored(np.repeat(values[..., :1], 3, -1), cosine_included=False)
-    np.testing.assert_allclose(load(path).values, expected, rtol=tolerance("formats.spectrum.rtol"))
+    np.testing.assert_allclose(imported(path).values, expected, rtol=tolerance("formats.spectrum.rtol"))
 
 
 def test_spectral_refuses_colours(tmp_path):
     path = folder(tmp_path / "s", spectral_name, exr(rgb))
     with pytest.raises(InputError, match="wavelengths"):
-        load(path)
+        imported(path)
 
 
 def test_atrium_hdr(tmp_path):
@@ -146,12 +142,12 @@ def test_atrium_hdr(tmp_path):
     values = material.pictures()
     name = lambda *pair: ubo_name(*pair, end="hdr")  # noqa: E731
     path = folder(tmp_path / "hdr", name, lambda v: radiance.encode(v, reversed_line=True), values)
-    found = load(path).values
+    found = imported(path).values
     assert b"+X 4 -Y 3\n" in (path / name(ANGLES[0], ANGLES[0])).read_bytes()
     error = np.abs(found - material.stored(values)).max(-1) / material.stored(values).max(-1)
     assert error.max() <= tolerance("formats.radiance.max")
     usual = folder(tmp_path / "usual", name, radiance.encode, values)
-    np.testing.assert_array_equal(load(usual).values, found)
+    np.testing.assert_array_equal(imported(usual).values, found)
 
 
 def test_radiance_run_lengths():
@@ -178,7 +174,7 @@ def test_orientation(end, tmp_path):
         "exr": exr(rgb),
         "hdr": lambda v: radiance.encode(v, reversed_line=True),
     }[end]
-    found = load(
+    found = imported(
         folder(tmp_path / end, lambda *pair: ubo_name(*pair, end=end), make, values), gamma=1.0
     ).values[1, 2]
     assert found.shape == (16, 24, 3)
@@ -230,7 +226,7 @@ def test_moved_light(tmp_path):
     np.testing.assert_allclose(SampledBTF.load(store.path).values, expected, rtol=DECODED)
     assert len(store.attributes["parent"]["lights_moved"]) == 5
     # Where the values do not hold the cosine, f is taken as it is.
-    other = load(path, tmp_path / "n.btf.zarr", cosine="excluded").values
+    other = imported(path, tmp_path / "n.btf.zarr", cosine="excluded").values
     np.testing.assert_allclose(
         other, material.stored(codes(values) ** 2.2, cosine_included=False), rtol=DECODED
     )
@@ -346,10 +342,6 @@ def sampled():
     return SampledBTF(material.pictures(8, 12).astype(np.float16), grid, grid, None, {})
 
 
-def back(path):
-    return SampledBTF.load(import_btf(path, path.with_name(path.name + ".btf.zarr"), dtype="float32").path)
-
-
 @pytest.mark.parametrize("name", ["out", "out.zip"])
 @pytest.mark.parametrize(
     ("format", "settings", "gate"),
@@ -365,7 +357,7 @@ def test_round_trip(format, settings, gate, name, sampled, tmp_path):
     facts = export_btf(sampled, tmp_path / name, format, **settings)
     assert facts["images"] == 25
     assert facts["clipped"] == 0
-    found = back(tmp_path / name)
+    found = imported(tmp_path / name)
     np.testing.assert_allclose(
         found.views.vectors, sampled.views.vectors, atol=tolerance("interpolation.exact.max")
     )
@@ -381,7 +373,7 @@ def test_round_trip(format, settings, gate, name, sampled, tmp_path):
 def test_jpeg_errs_as_jpeg_does(sampled, tmp_path):
     """What comes back is what Pillow makes of the same codes, and nothing is added to that."""
     export_btf(sampled, tmp_path / "x", "ubo", image="jpg", scale=2, quality=90)
-    found = back(tmp_path / "x").values
+    found = imported(tmp_path / "x").values
     codes = np.round(255 * (sampled.values.astype(np.float32) / 2) ** (1 / 2.2)).astype(np.uint8)[:, :, ::-1]
     for pair in ((0, 0), (2, 3), (4, 1)):
         stream = io.BytesIO()

@@ -7,6 +7,7 @@ import struct
 import formats_material as material
 import numpy as np
 import pytest
+from stores import imported
 
 from btfref.cli import main
 from btfref.errors import InputError
@@ -15,11 +16,6 @@ from btfref.formats.convert import import_btf as convert
 from btfref.gates import tolerance
 from btfref.numerics.sphere.directions import directions
 from btfref.sampling import SampledBTF, open_store
-
-
-def imported(path, **settings):
-    out = path.with_name(path.name + ".btf.zarr")
-    return SampledBTF.load(import_btf(path, out, dtype="float32", **settings).path)
 
 
 def test_every_format_is_named_and_titled():

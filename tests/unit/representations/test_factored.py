@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from factored_fits import KEYS, fit
 from oracle import oracle_btf
 
 from btfref.errors import InputError
@@ -15,15 +16,6 @@ from btfref.registry import methods
 from btfref.representations.factored import cmf, hf
 from btfref.representations.factored import fit as factored_fit
 from btfref.sampling import SampledBTF
-
-KEYS = ("cmf", "hf")
-
-#: Small maps make a quick test.
-QUICK = {"cmf": {"map_size": 16, "half_step": 10.0}, "hf": {"map_size": 16, "smoothness": 0.3}}
-
-
-def fit(key, btf, **parameters):
-    return methods()[key].fit(btf, **{**QUICK[key], **parameters})
 
 
 def upper(rng, n):

@@ -4,25 +4,16 @@ import dataclasses
 
 import numpy as np
 import pytest
+from factored_fits import KEYS, fit
 from oracle import oracle_btf
 from probes import hemisphere
 
 from btfref.gates.tolerances import tolerance
 from btfref.numerics.sphere.directions import directions
-from btfref.registry import methods
 from btfref.representations import load, read_info, save
 from btfref.representations.factored import cmf
 from btfref.representations.factored import storage as factored_storage
 from btfref.representations.factored.definition import decoded
-
-KEYS = ("cmf", "hf")
-
-#: Small maps make a quick test.
-QUICK = {"cmf": {"map_size": 16, "half_step": 10.0}, "hf": {"map_size": 16, "smoothness": 0.3}}
-
-
-def fit(key, btf, **parameters):
-    return methods()[key].fit(btf, **{**QUICK[key], **parameters})
 
 
 def sparse_btf(shape, dtype="float16"):

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from btfref.errors import InputError
 from btfref.mesostructure import build
 
 
@@ -113,28 +112,3 @@ def test_yarns_cross_over_and_under():
 
 def test_the_backing_may_be_left_out():
     assert len(build("tissue", backing_colour=None).parts) == 2
-
-
-@pytest.mark.parametrize(
-    ("name", "parameters", "field"),
-    [
-        ("rings", {"count": 0}, "count"),
-        ("rings", {"count": 2.5}, "count"),
-        ("rings", {"count": 5, "thickness": 0.1}, "thickness"),
-        ("rings", {"gap": 0}, "gap"),
-        ("rings", {"segments": 30}, "segments"),
-        ("rings", {"material": 3}, "material"),
-        ("rings", {"base_colour": (0.1, 0.2)}, "base_colour"),
-        ("tissue", {"count": 3}, "count"),
-        ("tissue", {"amplitude": 0.03}, "amplitude"),
-        ("tissue", {"width": 0.95}, "amplitude"),
-        ("tissue", {"segments": 90}, "segments"),
-        ("tissue", {"roughness": 2}, "roughness"),
-        ("tissue", {"weft_colour": (0.1, 2, 0)}, "weft_colour"),
-    ],
-)
-def test_bad_parameters_are_named(name, parameters, field):
-    with pytest.raises(InputError) as error:
-        build(name, **parameters)
-    assert error.value.field == field
-    assert "\n" not in str(error.value)
