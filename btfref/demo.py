@@ -114,7 +114,7 @@ def overview(rendered, against):
 
     best, raw = METHODS[0], METHODS[-1]
     plane = rendered[best, FLAT, "directional1"].images
-    flat = [plane["truth"], against[raw].images["reference"], plane["reference"], plane["realtime"]]
+    flat = [plane["truth"], against[raw].images["representation"], plane["reference"], plane["realtime"]]
     curved = [
         rendered[best, scene, "directional3"].images[side]
         for scene in ("sphere", "cloth")
@@ -223,9 +223,9 @@ class _Chain:
             comparison = compare(
                 reference.image, truth.image, classes=classes, gate="geometry.image", variance=truth.variance
             )
-        images = {"truth": truth.image, "reference": reference.image}
+        images = {"truth": truth.image, "representation": reference.image}
         notes = (
-            "The representation against the mesostructure itself, path traced: what sampling 81 × 81 "
+            "The representation (B) against the mesostructure itself, path traced (A): what sampling 81 × 81 "
             "directions on 64 × 64 texels and compression lose. Pixels near the border, where the geometry "
             "shows its edge, are left out."
         )

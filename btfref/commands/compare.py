@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from btfref.commands.shared.images import load_classes
 from btfref.commands.shared.options import add_define, add_grid, add_json, add_size
-from btfref.commands.shared.printing import emit, emit_json, number, table
+from btfref.commands.shared.printing import GATE_HEADER, emit, emit_json, gate_cells, number, table
 from btfref.commands.shared.reading import assignments, output_file
 from btfref.errors import InputError
 
@@ -112,8 +112,7 @@ def lines(comparison: Comparison) -> Iterator[str]:
     yield from table(rows, header=["", *classes])
     if comparison.gates:
         yield ""
+        yield from table(map(gate_cells, comparison.gates), header=GATE_HEADER)
     for gate in comparison.gates:
-        verdict = "pass" if gate.passed else "FAIL"
-        yield f"{verdict}  {gate.name}: {number(gate.value)}, limit {number(gate.limit)}"
         if not gate.passed:
-            yield f"      {gate.reason}"
+            yield f"FAIL  {gate.name}{f' ({gate.detail})' if gate.detail else ''}: {gate.reason}"

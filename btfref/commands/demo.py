@@ -7,9 +7,14 @@ with OpenGL, and compares the images. A finished store is used again.
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 from btfref.commands.shared.options import add_json
-from btfref.commands.shared.printing import Progress, emit, emit_json, number, table
+from btfref.commands.shared.printing import GATE_HEADER, Progress, emit, emit_json, gate_cells, table
+
+if TYPE_CHECKING:
+    from btfref.demo import DemoResult
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -37,15 +42,16 @@ def run(args: Namespace) -> int:
     return 0 if result.passed else 1
 
 
-def lines(result):
-    """The outcome for a reader."""
+def lines(result: DemoResult) -> Iterator[str]:
+    """The outcome for a reader: of each cell the gate that failed, or that is nearest to its limit."""
+    from btfref.gates.verdicts import deciding
+
     rows = []
     for cell in result.cells:
-        failed = [gate.name for gate in cell.all_gates if not gate.passed]
-        metrics = cell.comparison.metrics.get("interior") or cell.comparison.metrics["all"]
-        errors = [number(metrics.get(name)) for name in ("rel_p999", "rel_max")]
-        rows.append([cell.name, *errors, f"FAIL {', '.join(failed)}" if failed else "pass"])
-    yield from table(rows, header=["scene", "p99.9", "max", "gates"])
+        gate = deciding(cell.all_gates)
+        rows.append([cell.name, *(gate_cells(gate) if gate else ["none", "–", "–", "–", "–", "FAIL"])])
+    yield from table(rows, header=["cell", *GATE_HEADER])
+    yield "A row has the gate that failed, or else the one nearest to its limit; the report has them all."
     yield ""
     yield ", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in result.seconds.items())
     yield f"report: {result.report}"

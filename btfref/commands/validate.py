@@ -97,6 +97,7 @@ def lines(result: Validation) -> Iterator[str]:
 
 
 def _self_test(args: Namespace) -> int:
+    from btfref.gates.verdicts import with_class
     from btfref.validate.self_test import self_test
 
     with Progress() as progress:
@@ -105,7 +106,12 @@ def _self_test(args: Namespace) -> int:
         emit_json({"kind": "self-test", "schema": 1, "faults": [fault.to_dict() for fault in caught]})
     else:
         rows = [
-            [f.name, f.meant, "caught" if f.caught else "MISSED", ", ".join(f.failed) or "none"]
+            [
+                f.name,
+                with_class(f.meant),
+                "caught" if f.caught else "MISSED",
+                ", ".join(map(with_class, f.failed)) or "none",
+            ]
             for f in caught
         ]
         for line in table(rows, header=["fault", "meant for", "by it", "gates that failed"]):

@@ -3,12 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from btfref.errors import InputError
 from btfref.gates.tolerances import gate_table, limits
 from btfref.types import Facts
+
+#: Entries of ``tolerances.toml`` in words, and in short ones for the head of a narrow column.
+_WORDS = {
+    "p50": ("median relative error", "rel. error median"),
+    "p99": ("99 % relative error", "rel. error 99 %"),
+    "p999": ("99.9 % relative error", "rel. error 99.9 %"),
+    "max": ("largest relative error", "rel. error largest"),
+    "nonfinite": ("pixels not finite", "pixels"),
+    "max_abs": ("largest error", "largest error"),
+    "nrmse": ("RMSE / mean", "RMSE / mean"),
+    "failing_fraction": ("share of failing pixels", "failing share"),
+    "rejected_fraction": ("share of significant differences", "rejected share"),
+    "relative_rmse": ("RMSE / mean without noise", "RMSE / mean"),
+    "bias_fraction": ("bias / mean", "bias / mean"),
+}
+
+
+def limit_name(entry: str, *, short: bool = False) -> str:
+    """An entry of ``tolerances.toml`` in words; `short` for the head of a narrow column."""
+    plain = entry.removeprefix("min_").replace("_", " ")
+    return _WORDS.get(entry, (plain, plain))[short]
 
 
 @dataclass(frozen=True)
@@ -57,6 +78,16 @@ class GateResult:
     def sign(self) -> str:
         """Relation that the value must have to the limit."""
         return "≥" if self.entry.startswith("min_") else "≤"
+
+    @property
+    def share(self) -> float:
+        """How much of its limit the value takes: above 1 it fails, infinite where nothing was measured."""
+        if self.outcome == "empty":
+            return 0.0
+        if self.value is None or math.isnan(self.value):
+            return math.inf
+        part, whole = (self.limit, self.value) if self.sign == "≥" else (self.value, self.limit)
+        return part / whole if whole > 0 else math.inf if part > whole else 0.0
 
     @property
     def line(self) -> str:
@@ -136,6 +167,17 @@ def judge(
         _apply(f"{key}.{entry}", measured.get(names[entry]), limit, table["reason"], pixel_class)
         for entry, limit in wanted.items()
     ]
+
+
+def deciding(gates: Iterable[GateResult]) -> GateResult | None:
+    """The result that says most of a cell: what failed or is not decided, else what is nearest to its limit."""
+    return max(gates, key=lambda gate: (not gate.passed, gate.outcome == "fail", gate.share), default=None)
+
+
+def with_class(name: str) -> str:
+    """The name of a limit, and the class of pixels that its gate judges: ``image.noise_free.p999 [interior]``."""
+    judged = gate_table(name.rpartition(".")[0]).get("class")
+    return f"{name} [{judged}]" if judged else name
 
 
 def missing_reference(key: str, what: str) -> list[GateResult]:

@@ -20,6 +20,10 @@ LABELS = {
     "realtime": ("Real-time", "GLSL on float32 targets, the same sub-pixel grid"),
     "truth": ("Geometry truth", "the mesostructure itself, path traced"),
     "geometry": ("Geometry truth", "the mesostructure itself, path traced"),
+    "representation": (
+        "Representation",
+        "the BTF on the flat shape, path traced by its plugin in the same scene",
+    ),
     "definition": ("Definition", "the float64 evaluator in NumPy"),
     "test": ("Test", "the picture under test"),
 }
@@ -72,13 +76,19 @@ class Cell:
 
     @property
     def pair(self):
-        """Labels of the two pictures shown first: what the comparison took as reference, and as test."""
+        """Labels of the two pictures shown first: what the comparison took as reference (A), and as test (B)."""
         labels = list(self.images)
         first = self._label_of("reference") or ("reference" if "reference" in labels else labels[0])
         others = [label for label in labels if label != first]
         usual = [label for label in ("realtime", "test") if label in others]
         test = self._label_of("test")
         return first, test if test in others else [*usual, *others, first][0]
+
+    @property
+    def names(self):
+        """Names of the two pictures shown first: what was tested (B), and what it is compared with (A)."""
+        first, second = self.pair
+        return tuple(LABELS.get(key, (key,))[0] for key in (second, first))
 
     def _label_of(self, side):
         """The picture that is one side of the comparison."""

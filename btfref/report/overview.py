@@ -5,9 +5,10 @@ from __future__ import annotations
 from html import escape
 
 from btfref.conventions import PixelClass
+from btfref.gates.verdicts import limit_name
 from btfref.report.cell import full_scale, label_of, signed_difference
 from btfref.report.figures import diverging, thumbnail
-from btfref.report.text import badge, limit_name, number
+from btfref.report.text import badge, number
 
 #: Column title and metric of the interior, after the gates.
 SHOWN = {"ΔE00": "delta_e00_mean", "FLIP": "flip_mean", "RMSE / mean": "nrmse"}
@@ -55,7 +56,8 @@ def overview(cells):
         groups.setdefault(gate.gate, []).append(gate)
     names = {key: escape(key).replace(".", ".<wbr>") for key in groups}
     top = "".join(
-        f'<th scope="colgroup" colspan="{len(members)}"><code>{names[key]}</code></th>'
+        f'<th scope="colgroup" colspan="{len(members)}"><code>{names[key]}</code>'
+        f"<small>{members[0].pixel_class}</small></th>"
         for key, members in groups.items()
     )
     columns = [gate for members in groups.values() for gate in members]

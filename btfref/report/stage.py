@@ -7,10 +7,11 @@ from html import escape
 import numpy as np
 
 from btfref.conventions import PixelClass
+from btfref.gates.verdicts import limit_name
 from btfref.report.cell import LABELS, asset, full_scale, label_of, script_json, signed_difference
 from btfref.report.figures import error_histogram, p_value_histogram
 from btfref.report.pack import pack
-from btfref.report.text import badge, class_table, gate_list, limit_name, number
+from btfref.report.text import badge, class_table, gate_list, number
 
 
 def article(index, cell, *, extra="", images=None, bits=6):
@@ -45,7 +46,9 @@ def article(index, cell, *, extra="", images=None, bits=6):
     if cell.images:
         parts.append(_stage(index, cell, images, bits))
     parts.append(extra)
-    table = class_table(cell.comparison) if cell.comparison and cell.comparison.metrics else ""
+    table = ""
+    if cell.comparison and cell.comparison.metrics:
+        table = class_table(cell.comparison, " against ".join(cell.names) if cell.images else "")
     parts.append(
         f'<div class="numbers"><section>{table}{_remarks(cell.comparison)}</section>'
         f'<section class="gatebox"><h3>Gates</h3>{gate_list(cell.all_gates)}</section></div></article>'
@@ -102,7 +105,7 @@ def _stage(index, cell, packed, bits):
         pixels |= _maps(cell.comparison, bits)
         charts = _charts(cell.comparison, limits)
     first, second = cell.pair
-    pixels["pair"] = [LABELS.get(key, (key,))[0] for key in (second, first)]
+    pixels["pair"] = list(cell.names)
     viewer = (
         asset("viewer.html").replace("{{A}}", _options(cell, first)).replace("{{B}}", _options(cell, second))
     )

@@ -6,6 +6,7 @@ import math
 from html import escape
 
 from btfref.conventions import PixelClass
+from btfref.gates.verdicts import limit_name
 
 OUTCOME = {
     "pass": ("✓", "pass"),
@@ -82,12 +83,14 @@ def badge(outcome, text=None):
     )
 
 
-def class_table(comparison):
+def class_table(comparison, pictures=""):
     """Metrics by pixel class.
 
     Parameters
     ----------
     comparison : Comparison
+    pictures : str
+        Which picture was compared with which, for the caption.
 
     Returns
     -------
@@ -132,7 +135,7 @@ def class_table(comparison):
         body.append(f'<tr><th scope="row" title="{title}">significant differences</th>{"".join(cells)}</tr>')
     return (
         '<div class="scroll"><table class="metrics">'
-        "<caption>Errors of linear radiance by pixel class</caption>"
+        f"<caption>Errors of linear radiance by pixel class{': ' if pictures else ''}{escape(pictures)}</caption>"
         f'<thead><tr><th scope="col">metric</th>{head}</tr></thead>'
         f"<tbody>{''.join(body)}</tbody></table></div>"
     )
@@ -162,44 +165,23 @@ def gate_list(gates):
     for key, members in groups.items():
         rows = "".join(
             f'<tr class="{gate.outcome}"><th scope="row">{escape(limit_name(gate.entry))}</th>'
-            f"<td>{number(gate.value)}</td><td>{gate.sign} {number(gate.limit)}</td>"
+            f"<td>{gate.pixel_class or '–'}</td><td>{number(gate.value)}</td>"
+            f"<td>{gate.sign} {number(gate.limit)}</td>"
             f"<td>{badge(gate.outcome)}</td></tr>"
             + (
-                f'<tr class="detail"><td colspan="4">{escape(gate.detail)}</td></tr>'
+                f'<tr class="detail"><td colspan="5">{escape(gate.detail)}</td></tr>'
                 if gate.detail and gate.outcome != "empty"
                 else ""
             )
             for gate in members
         )
-        pixel_class = (
-            f' <span class="muted">{members[0].pixel_class}</span>' if members[0].pixel_class else ""
-        )
         parts.append(
-            f'<div class="gate"><h4><code>{escape(key)}</code>{pixel_class}</h4><table class="gates">'
-            '<thead><tr><th scope="col">limit on</th><th scope="col">value</th><th scope="col">limit</th>'
-            f'<th scope="col">outcome</th></tr></thead><tbody>{rows}</tbody></table>'
+            f'<div class="gate"><h4><code>{escape(key)}</code></h4><div class="scroll"><table class="gates">'
+            '<thead><tr><th scope="col">limit on</th><th scope="col">pixels</th><th scope="col">value</th>'
+            f'<th scope="col">limit</th><th scope="col">outcome</th></tr></thead><tbody>{rows}</tbody></table></div>'
             f"<details><summary>why these limits</summary><p>{escape(members[0].reason)}</p></details></div>"
         )
     return "".join(parts) or '<p class="muted">No gate was applied.</p>'
-
-
-def limit_name(entry, *, short=False):
-    """An entry of ``tolerances.toml`` in words; `short` for the head of a narrow column."""
-    words = {
-        "p50": ("median relative error", "rel. error median"),
-        "p99": ("99 % relative error", "rel. error 99 %"),
-        "p999": ("99.9 % relative error", "rel. error 99.9 %"),
-        "max": ("largest relative error", "rel. error largest"),
-        "nonfinite": ("pixels not finite", "pixels"),
-        "max_abs": ("largest error", "largest error"),
-        "nrmse": ("RMSE / mean", "RMSE / mean"),
-        "failing_fraction": ("share of failing pixels", "failing share"),
-        "rejected_fraction": ("share of significant differences", "rejected share"),
-        "relative_rmse": ("RMSE / mean without noise", "RMSE / mean"),
-        "bias_fraction": ("bias / mean", "bias / mean"),
-    }
-    plain = entry.removeprefix("min_").replace("_", " ")
-    return words.get(entry, (plain, plain))[short]
 
 
 def facts_list(facts):

@@ -7,6 +7,7 @@ import shutil
 from html import escape
 from pathlib import Path
 
+from btfref.gates.verdicts import with_class
 from btfref.report.cell import Cell, asset, script_json
 from btfref.report.figures import thumbnail
 from btfref.report.pack import pack, pack_text
@@ -340,6 +341,12 @@ def _methods(result):
 
 def _self_test(caught):
     body = [
-        [f.name, f.meant, "caught" if f.caught else "missed", ", ".join(f.failed) or "none"] for f in caught
+        [
+            f.name,
+            with_class(f.meant),
+            "caught" if f.caught else "missed",
+            ", ".join(map(with_class, f.failed)) or "none",
+        ]
+        for f in caught
     ]
     return _table(["fault", "meant for", "by it", "gates that failed"], body)

@@ -6,7 +6,10 @@ import json
 import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from btfref.gates import GateResult
 
 
 def emit(text: str = "", *, flush: bool = False) -> None:
@@ -95,6 +98,19 @@ def number(value: float | str | None) -> str:
     if isinstance(value, bool | str):
         return str(value)
     return f"{value:.4g}"
+
+
+#: What :func:`gate_cells` gives, as the head of a table.
+GATE_HEADER = ("gate", "pixels", "measure", "value", "limit", "")
+
+
+def gate_cells(gate: GateResult) -> list[str]:
+    """A gate's result as cells of a table: what it judges, of which class of pixels, the limit and the verdict."""
+    from btfref.gates.verdicts import limit_name
+
+    verdict = "pass" if gate.passed else "FAIL" if gate.outcome == "fail" else gate.outcome.upper()
+    limit = f"{gate.sign} {gate.limit:g}"
+    return [gate.gate, gate.pixel_class or "–", limit_name(gate.entry), number(gate.value), limit, verdict]
 
 
 def bytes_text(n: float) -> str:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -314,7 +315,9 @@ def test_compare_prints_gates_and_decides(tmp_path, capsys):
         save_image(tmp_path / f"{name}.exr", image * factor)
     a, b, c = (str(tmp_path / f"{name}.exr") for name in "abc")
     assert main(["compare", b, a, "--gate", "image.noise_free"]) == 0
-    assert "pass  image.noise_free" in capsys.readouterr().out
+    assert re.search(
+        r"^image\.noise_free +interior .* ≤ 0\.001 +pass$", capsys.readouterr().out, re.MULTILINE
+    )
     assert main(["compare", c, a, "--gate", "image.noise_free"]) == 1
     assert "FAIL  image.noise_free" in capsys.readouterr().out
     assert main(["compare", c, a]) == 0
@@ -324,6 +327,27 @@ def test_compare_prints_gates_and_decides(tmp_path, capsys):
     assert not facts["passed"]
     images.save_classes(tmp_path / "k.png", np.zeros((16, 16), np.uint8))
     assert main(["compare", b, a, "--classes", str(tmp_path / "k.png"), "--gate", "image.noise_free"]) == 1
+
+
+def test_rows_of_gates_name_measure_class_and_limit():
+    from btfref.commands import compare, demo
+    from btfref.comparison import compare as compared
+    from btfref.demo import DemoResult
+    from btfref.report import Cell
+
+    truth = np.random.default_rng(0).uniform(0.2, 0.4, (8, 8, 3))
+    geometry = compared(truth * 1.1, truth, gate="geometry.image")
+    exact = compared(truth * (1 + 4e-4), truth, gate="image.noise_free")
+    cells = [Cell("raw against geometry", {}, geometry), Cell("sphere", {}, exact), Cell("nothing")]
+    lines = list(demo.lines(DemoResult(cells, "report.html", {"fit": 1.0})))
+    rows = [" ".join(line.split()) for line in lines]
+    assert rows[0].split() == ["cell", "gate", "pixels", "measure", "value", "limit"]
+    assert rows[2] == "raw against geometry geometry.image interior bias / mean 0.1 ≤ 0.2 pass"
+    assert rows[3] == "sphere image.noise_free interior 99.9 % relative error 0.0004 ≤ 0.001 pass"
+    assert rows[4].endswith("FAIL")
+    shown = [" ".join(line.split()) for line in compare.lines(exact)]
+    assert "gate pixels measure value limit" in shown
+    assert "image.noise_free interior largest relative error 0.0004 ≤ 0.01 pass" in shown
 
 
 def test_info_of_images(tmp_path, capsys):

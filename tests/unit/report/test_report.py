@@ -23,6 +23,11 @@ FACTS = {
     "versions": {"btfref": "0.1.0", "mitsuba": "3.9.1"},
     "seeds": {"render": 0},
     "commands": ["btfref demo --out report.html"],
+    # Facts within facts within facts, and words that do not break, as the demo has them.
+    "renderers": {
+        "geometry truth": {"mesostructure": {"name": "checker", "parameters": {"amplitude": 0.1}}},
+        "real time": {"resident_views": {"/a/long/path/without/a/place/to/break/checker.lpca.exr": 81}},
+    },
 }
 
 
@@ -274,9 +279,7 @@ DRIVER = """
   found.rescaled = before !== ticks();
   document.getElementById("theme").click(); document.getElementById("theme").click();
   found.theme = root.dataset.theme;
-  const out = document.createElement("pre");
-  out.id = "found"; out.textContent = JSON.stringify(found);
-  document.body.append(out);
+  parent.postMessage(JSON.stringify(found), "*");
 })();
 </script></body>"""
 

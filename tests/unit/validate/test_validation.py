@@ -246,8 +246,7 @@ addEventListener("load", async () => {
     const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
     found.painted = data.some((x, i) => i % 4 !== 3 && x > 0);
   }
-  const out = document.createElement("pre"); out.id = "found"; out.textContent = JSON.stringify(found);
-  document.body.append(out);
+  parent.postMessage(JSON.stringify(found), "*");
 });
 </script></body>"""
 
