@@ -4,10 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from btfref.scene.shipped import scene_file
+from btfref.types import Facts, PathLike, Progress
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from btfref.rendering.result import RenderResult
+    from btfref.report import Cell
 
 SCENES = ("plane", "sphere", "cloth")
 LIGHTS = {
@@ -49,17 +58,17 @@ class DemoResult:
         Wall-clock time of each stage.
     """
 
-    cells: list
+    cells: list[Cell]
     report: Path
-    seconds: dict
+    seconds: dict[str, float]
 
     @property
-    def passed(self):
+    def passed(self) -> bool:
         """Whether every gate of every cell passed."""
         return all(cell.outcome == "pass" for cell in self.cells)
 
 
-def demo(output="output/demo", *, progress=None):
+def demo(output: PathLike = "output/demo", *, progress: Progress | None = None) -> DemoResult:
     """Run the whole chain and write a report.
 
     Parameters
@@ -96,7 +105,7 @@ def demo(output="output/demo", *, progress=None):
     return DemoResult(cells, report, chain.seconds)
 
 
-def overview(rendered, against):
+def overview(rendered: Mapping[tuple[str, str, str], Cell], against: Mapping[str, Cell]) -> np.ndarray:
     """Eight pictures in two rows, for the README.
 
     Parameters
@@ -128,16 +137,16 @@ class _Chain:
     """The stages, with what they share: files, pixel classes, truths, times, facts about renderers."""
 
     output: Path
-    progress: object
-    files: dict = field(default_factory=dict)
-    classes: dict = field(default_factory=dict)
-    truths: dict = field(default_factory=dict)
-    seconds: dict = field(default_factory=dict)
-    renderers: dict = field(default_factory=dict)
+    progress: Progress
+    files: dict[str, Path] = field(default_factory=dict)
+    classes: dict[str, np.ndarray] = field(default_factory=dict)
+    truths: dict[str, tuple[RenderResult, np.ndarray]] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    renderers: dict[str, Facts] = field(default_factory=dict)
     synthesis: dict = field(default_factory=dict)
 
     @contextlib.contextmanager
-    def timed(self, stage):
+    def timed(self, stage: str) -> Iterator[None]:
         """Add the time of a block to a stage."""
         start = time.perf_counter()
         try:
@@ -145,7 +154,7 @@ class _Chain:
         finally:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
-    def make_material(self):
+    def make_material(self) -> None:
         """Sampled BTF and representations."""
         from btfref.registry import method
         from btfref.representations.file.container import save
@@ -164,11 +173,11 @@ class _Chain:
                 self.files[key] = (self.output / f"checker.{key}.exr").resolve()
                 save(method(key).fit(btf, seed=settings.seed, progress=self.progress), self.files[key])
 
-    def arguments(self, method, scene, lights):
+    def arguments(self, method: str, scene: str, lights: str) -> tuple[Path, dict[str, str]]:
         """What every renderer is called with."""
         return scene_file(scene), {"btf": str(self.files[method]), "lights": lights}
 
-    def reference(self, method, scene, lights):
+    def reference(self, method: str, scene: str, lights: str) -> RenderResult:
         """The noise-free reference, and the pixel classes of the scene."""
         from btfref.rendering.offline.reference import render
         from btfref.scene.pixel_classes import pixel_classes
@@ -181,7 +190,7 @@ class _Chain:
         self.renderers["reference"] = result.meta
         return result
 
-    def truth(self, lights):
+    def truth(self, lights: str) -> tuple[RenderResult, np.ndarray]:
         """The mesostructure itself, path traced, and the pixels where it may be compared."""
         from btfref.rendering.offline.geometry import geometry_classes, render_geometry
 
@@ -193,7 +202,7 @@ class _Chain:
             self.renderers["geometry truth"] = result.meta
         return self.truths[lights]
 
-    def renderers_cell(self, method, scene, lights):
+    def renderers_cell(self, method: str, scene: str, lights: str) -> Cell:
         """Real-time image against the reference, both reading one file and one scene."""
         from btfref.comparison import compare
         from btfref.rendering.gl.renderer import realtime
@@ -212,7 +221,7 @@ class _Chain:
         notes = f"Both renderers read {self.files[method].name} and {path.name}. Neither casts shadows."
         return Cell(f"{method} · {scene} · {LIGHTS[lights]}", images, comparison, notes)
 
-    def geometry_cell(self, method, lights):
+    def geometry_cell(self, method: str, lights: str) -> Cell:
         """A representation on the plane against the path-traced mesostructure."""
         from btfref.comparison import compare
         from btfref.report import Cell
@@ -231,7 +240,7 @@ class _Chain:
         )
         return Cell(f"{method} against geometry · {FLAT} · {LIGHTS[lights]}", images, comparison, notes)
 
-    def facts(self):
+    def facts(self) -> Facts:
         """What the report says about how it was made."""
         from btfref.representations.file.container import read_info
 

@@ -10,11 +10,13 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 
 from btfref import platform, system
 from btfref.provenance import RELEVANT, versions
+from btfref.types import Facts
 
 #: Mitsuba variants that btfref uses, and whether it can do without.
 VARIANTS = {"llvm_ad_rgb": True, "scalar_rgb": True, "cuda_ad_rgb": False}
@@ -91,19 +93,19 @@ class Examination:
     """
 
     checks: tuple[Check, ...]
-    facts: dict
+    facts: Facts
 
     @property
-    def ok(self):
+    def ok(self) -> bool:
         """Whether nothing needed is missing."""
         return all(check.status != "missing" for check in self.checks)
 
-    def to_dict(self):
+    def to_dict(self) -> Facts:
         """JSON-able form."""
         return {"ok": self.ok, "checks": [asdict(check) for check in self.checks], **self.facts}
 
 
-def probe(code, *arguments, environment=None):
+def probe(code: str, *arguments: str, environment: Mapping[str, str] | None = None) -> Facts:
     """Run Python code in a process of its own and read the JSON on the last line of its output.
 
     Returns
@@ -134,7 +136,7 @@ def probe(code, *arguments, environment=None):
     return {"works": False, "error": said[-1] if said else f"exit status {done.returncode}"}
 
 
-def _gpu():
+def _gpu() -> list[str]:
     """Name and memory of each NVIDIA GPU that the driver lists."""
     if shutil.which("nvidia-smi") is None:
         return []
@@ -146,17 +148,18 @@ def _gpu():
     return [line.strip() for line in done.stdout.splitlines() if line.strip()] if done.returncode == 0 else []
 
 
-def _memory():
+def _memory() -> tuple[int, int] | None:
     """Total and available memory in bytes, or None where the kernel does not say."""
     try:
         with open("/proc/meminfo") as file:
             fields = dict(line.split(":", 1) for line in file)
-        return tuple(int(fields[key].split()[0]) * 1024 for key in ("MemTotal", "MemAvailable"))
+        total, available = (int(fields[key].split()[0]) * 1024 for key in ("MemTotal", "MemAvailable"))
+        return total, available
     except (OSError, KeyError, ValueError):
         return None
 
 
-def machine():
+def machine() -> Facts:
     """Cores this process may use, memory and operating system.
 
     Returns
@@ -179,7 +182,7 @@ def machine():
     }
 
 
-def examine():
+def examine() -> Examination:
     """Look at the machine: variants, LLVM, OpenGL, GPU, versions, programs.
 
     Returns
@@ -196,10 +199,10 @@ def examine():
             # Without a usable LLVM Dr.Jit would pick one of the refused ones by itself.
             if not (name.startswith("llvm") and llvm.path is None)
         }
-        gl = pool.submit(probe, _GL_PROBE, environment={"GALLIVM_PERF": "no_aos_sampling"})
-        gpu = pool.submit(_gpu)
+        drawing = pool.submit(probe, _GL_PROBE, environment={"GALLIVM_PERF": "no_aos_sampling"})
+        cards = pool.submit(_gpu)
         variants = {name: result.result() for name, result in waiting.items()}
-        gl, gpu = gl.result(), gpu.result()
+        gl, gpu = drawing.result(), cards.result()
     for name in VARIANTS:
         variants.setdefault(name, {"works": False, "error": "no usable LLVM library"})
     programs = {
@@ -224,11 +227,11 @@ def examine():
     return Examination(tuple(_checks(facts)), facts)
 
 
-def _llvm_environment(llvm):
+def _llvm_environment(llvm: platform.LLVMChoice) -> dict[str, str]:
     return {"DRJIT_LIBLLVM_PATH": llvm.path} if llvm.path else {}
 
 
-def _checks(facts):
+def _checks(facts: Facts) -> Iterator[Check]:
     """The lines for a reader, from the facts."""
     yield from _version_checks(facts["versions"])
     yield from _library_checks(facts["missing"])
@@ -238,7 +241,7 @@ def _checks(facts):
     yield from _program_checks(facts["programs"])
 
 
-def _version_checks(installed):
+def _version_checks(installed: Mapping[str, str | None]) -> Iterator[Check]:
     reinstall = "run make setup, or pip install btfref again"
     for name, version in installed.items():
         if version is None:
@@ -250,7 +253,7 @@ def _version_checks(installed):
             yield Check("versions", name, "ok", version)
 
 
-def _library_checks(missing):
+def _library_checks(missing: Collection[str]) -> Iterator[Check]:
     for requirement in system.REQUIREMENTS:
         # LLVM has its own lines.
         if not requirement.for_tests and requirement is not system.LLVM:
@@ -261,7 +264,7 @@ def _library_checks(missing):
                 yield Check("system libraries", requirement.name, "ok", "found")
 
 
-def _llvm_checks(llvm):
+def _llvm_checks(llvm: Facts) -> Iterator[Check]:
     mend = system.mend_command([system.LLVM])
     if llvm["chosen"] is None:
         yield Check("Mitsuba", "LLVM", "missing", llvm["reason"], mend)
@@ -274,7 +277,7 @@ def _llvm_checks(llvm):
         yield Check("Mitsuba", "LLVM refused", "ok", f"{old} (older ones abort the process; never loaded)")
 
 
-def _variant_checks(variants, gpu):
+def _variant_checks(variants: Mapping[str, Facts], gpu: Sequence[str]) -> Iterator[Check]:
     for name, needed in VARIANTS.items():
         result = variants[name]
         if result["works"] and result["finite"]:
@@ -292,7 +295,7 @@ def _variant_checks(variants, gpu):
     yield Check("Mitsuba", "GPU", "ok" if gpu else "absent", "; ".join(gpu) or "none")
 
 
-def _gl_checks(gl):
+def _gl_checks(gl: Facts) -> Iterator[Check]:
     if not gl["works"]:
         mend = "mend the system libraries above first; if none is missing, install the driver of your GPU"
         yield Check("OpenGL", "EGL context", "missing", gl["error"], mend)
@@ -309,7 +312,7 @@ def _gl_checks(gl):
         yield Check("OpenGL", "float32 target", "missing", "clamps or rounds", "another OpenGL driver")
 
 
-def _program_checks(programs):
+def _program_checks(programs: Mapping[str, str | None]) -> Iterator[Check]:
     for requirement in system.REQUIREMENTS:
         if requirement.for_tests:
             path = programs["chromium" if requirement.name == "Chromium" else requirement.name]

@@ -32,7 +32,7 @@ def run(args: Namespace) -> int:
     with Progress() as progress:
         result = demo(args.output, progress=progress)
     if args.json:
-        cells = {cell.name: cell.comparison.to_dict() for cell in result.cells}
+        cells = {cell.name: cell.comparison and cell.comparison.to_dict() for cell in result.cells}
         emit_json(
             {"passed": result.passed, "report": result.report, "seconds": result.seconds, "cells": cells}
         )

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.colour import encode_srgb
 from btfref.outputs import new_file
-from btfref.sampling.store.store import open_store
+from btfref.sampling.store.store import BTFStore, open_store
+from btfref.types import PathLike
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import SubFigure
+    from matplotlib.image import AxesImage
+
+    from btfref.numerics.sphere.directions import DirectionSet
 
 #: Most views and most lights of the contact sheet, lights of the apparent BRDFs, views that maps are averaged over.
 SHEET, LOBES, AVERAGED = 7, 4, 12
@@ -21,7 +31,7 @@ DISK, THUMBNAIL = 160, 96
 DECADES = 2.0
 
 
-def plot_btf(path, out, *, texel=None):
+def plot_btf(path: PathLike, out: PathLike, *, texel: Sequence[int] | None = None) -> None:
     """Draw a sampled BTF.
 
     Parameters
@@ -42,8 +52,8 @@ def plot_btf(path, out, *, texel=None):
     if not store.coverage.any():
         raise InputError("nothing is there yet", file=path, field="coverage")
     rows, columns = store.texels
-    texel = (rows // 2, columns // 2) if texel is None else tuple(texel)
-    if not (0 <= texel[0] < rows and 0 <= texel[1] < columns):
+    row, column = (rows // 2, columns // 2) if texel is None else texel
+    if not (0 <= row < rows and 0 <= column < columns):
         raise InputError(
             "no such texel", file=path, field="texel", got=texel, expected=f"within {rows}, {columns}"
         )
@@ -53,11 +63,11 @@ def plot_btf(path, out, *, texel=None):
 
     figure = Figure(figsize=(15, 13), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
-    top, bottom = figure.subfigures(2, 1, height_ratios=(1.9, 1.0))
-    sheet, maps = top.subfigures(1, 2, width_ratios=(2.1, 1.0))
+    top, bottom = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.9, 1.0)).flat
+    sheet, maps = top.subfigures(1, 2, squeeze=False, width_ratios=(2.1, 1.0)).flat
     scale = _contact_sheet(sheet, store)
     _maps(maps, store, scale)
-    _lobes(bottom, store, texel)
+    _lobes(bottom, store, (row, column))
     name = store.attributes.get("parent", {}).get("name", store.path.name)
     figure.suptitle(
         f"{Path(path).name}: {name}, {rows} × {columns} texels, {len(store.views)} views × {len(store.lights)} lights",
@@ -67,7 +77,7 @@ def plot_btf(path, out, *, texel=None):
         figure.savefig(draft, format="png", dpi=100)
 
 
-def _spread(directions, count):
+def _spread(directions: DirectionSet, count: int) -> list[int]:
     """Directions that show how a set varies: along the meridian of its first azimuth, then across."""
     theta, phi = directions.theta, directions.phi
     rings = np.unique(np.round(theta, 6))
@@ -83,11 +93,11 @@ def _spread(directions, count):
     return chosen
 
 
-def _label(directions, k):
+def _label(directions: DirectionSet, k: int) -> str:
     return f"{np.degrees(directions.theta[k]):.0f}°, {np.degrees(directions.phi[k]):.0f}°"
 
 
-def _image(store, view, light):
+def _image(store: BTFStore, view: int, light: int) -> np.ndarray:
     """Values of one pair, (rows, columns, 3) float64; NaN where they are not there."""
     image = np.full((*store.texels, 3), np.nan)
     covered = store.covered(view)[light]
@@ -101,14 +111,14 @@ def _image(store, view, light):
     return image
 
 
-def _shown(image, scale):
+def _shown(image: np.ndarray, scale: float) -> np.ndarray:
     """Display colours in [0, 1]; grey where there is nothing."""
     there = np.isfinite(image).all(-1, keepdims=True)
     linear = np.clip(np.nan_to_num(image) * scale, 0, 1)
     return np.where(there, encode_srgb(linear), 0.55)
 
 
-def _contact_sheet(figure, store):
+def _contact_sheet(figure: SubFigure, store: BTFStore) -> float:
     """View × light; the scale that brings the brightest per cent of all to white."""
     views, lights = _spread(store.views, SHEET), _spread(store.lights, SHEET)
     pictures = np.stack([[_image(store, v, k) for k in lights] for v in views])
@@ -131,7 +141,7 @@ def _contact_sheet(figure, store):
     return scale
 
 
-def _covered_views(store):
+def _covered_views(store: BTFStore) -> np.ndarray:
     """Views that are there for all lights and tiles, spread over the set."""
     there = np.flatnonzero(store.coverage.all(axis=(1, 2, 3)))
     if len(there) > AVERAGED:
@@ -139,7 +149,7 @@ def _covered_views(store):
     return there
 
 
-def _maps(figure, store, scale):
+def _maps(figure: SubFigure, store: BTFStore, scale: float) -> None:
     """Albedo seen along the normal, relative standard error, and samples where they differ."""
     samples = store.maps("samples")
     axes = figure.subplots(3 if samples is not None else 2, 1)
@@ -158,6 +168,7 @@ def _maps(figure, store, scale):
         for view in there:
             values, spread = store.read(views=view)
             total += values[0].mean((0, -1), dtype=np.float64)
+            assert spread is not None  # the store has a variance
             variance += spread[0].mean((0, -1), dtype=np.float64)
         error = np.sqrt(variance * len(there)) / np.maximum(total, 0.1 * total.mean() + 1e-12)
         picture = axes[1].imshow(100 * error, origin="lower", interpolation="nearest", cmap="magma", vmin=0)
@@ -177,7 +188,7 @@ def _maps(figure, store, scale):
             axis.text(0.5, 0.5, "no view is complete yet", ha="center", transform=axis.transAxes)
 
 
-def _lobes(figure, store, texel):
+def _lobes(figure: SubFigure, store: BTFStore, texel: tuple[int, int]) -> None:
     """Apparent BRDF of one texel: what it sends to all views for a few lights, and takes from all lights."""
     axes = figure.subplots(2, LOBES, squeeze=False)
     lights, views = _spread(store.lights, LOBES), _spread(store.views, LOBES)
@@ -220,7 +231,9 @@ def _lobes(figure, store, texel):
     )
 
 
-def _column(store, texel, *, view=None, light=None):
+def _column(
+    store: BTFStore, texel: tuple[int, int], *, view: int | None = None, light: int | None = None
+) -> np.ndarray:
     """One texel for one light and all views, or one view and all lights: (n, 3), NaN where not there."""
     row, column = texel
     tile = row // store.tile[0], column // store.tile[1]
@@ -234,7 +247,7 @@ def _column(store, texel, *, view=None, light=None):
     return result
 
 
-def hemisphere(directions, values):
+def hemisphere(directions: DirectionSet, values: np.ndarray) -> np.ndarray:
     """Values interpolated over a disk whose radius is θ, azimuth 0 to the right.
 
     Parameters
@@ -259,7 +272,9 @@ def hemisphere(directions, values):
     return np.where((radius <= 1).ravel() & known, image, np.nan).reshape(DISK, DISK)
 
 
-def _hemisphere(axis, directions, values, largest, other):
+def _hemisphere(
+    axis: Axes, directions: DirectionSet, values: np.ndarray, largest: float, other: np.ndarray
+) -> AxesImage:
     """A hemisphere on a logarithmic scale, with the other direction marked."""
     shown = np.log10(np.maximum(hemisphere(directions, values), 1e-30))
     high = np.log10(max(largest, 1e-30))

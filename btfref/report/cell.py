@@ -12,6 +12,7 @@ import numpy as np
 from btfref.comparison.comparison import Comparison, json_safe
 from btfref.conventions import PixelClass
 from btfref.errors import InputError
+from btfref.gates.verdicts import GateResult
 from btfref.images.display import Display, fit_display
 
 #: Label of a picture → its name and what it shows.
@@ -49,18 +50,18 @@ class Cell:
     """
 
     name: str
-    images: dict = field(default_factory=dict)
+    images: dict[str, np.ndarray] = field(default_factory=dict)
     comparison: Comparison | None = None
     notes: str = ""
-    gates: tuple = ()
+    gates: tuple[GateResult, ...] = ()
 
     @property
-    def all_gates(self):
+    def all_gates(self) -> tuple[GateResult, ...]:
         """Gates of the comparison and the cell's own."""
         return (*(self.comparison.gates if self.comparison else ()), *self.gates)
 
     @property
-    def outcome(self):
+    def outcome(self) -> str:
         """``pass``, ``inconclusive`` or ``fail``; without any gate ``fail``."""
         outcomes = {gate.outcome for gate in self.all_gates}
         if not outcomes or "fail" in outcomes or (self.comparison is None and self.images):
@@ -68,14 +69,14 @@ class Cell:
         return "inconclusive" if "inconclusive" in outcomes else "pass"
 
     @property
-    def display(self):
+    def display(self) -> Display:
         """The comparison's display, or one made for the first picture."""
         if self.comparison is not None and "display" in self.comparison.settings:
             return Display(self.comparison.settings["display"]["stops"])
         return fit_display(next(iter(self.images.values())))
 
     @property
-    def pair(self):
+    def pair(self) -> tuple[str, str]:
         """Labels of the two pictures shown first: what the comparison took as reference (A), and as test (B)."""
         labels = list(self.images)
         first = self._label_of("reference") or ("reference" if "reference" in labels else labels[0])
@@ -85,18 +86,18 @@ class Cell:
         return first, test if test in others else [*usual, *others, first][0]
 
     @property
-    def names(self):
+    def names(self) -> tuple[str, str]:
         """Names of the two pictures shown first: what was tested (B), and what it is compared with (A)."""
         first, second = self.pair
-        return tuple(LABELS.get(key, (key,))[0] for key in (second, first))
+        return _name(second), _name(first)
 
-    def _label_of(self, side):
+    def _label_of(self, side: str) -> str | None:
         """The picture that is one side of the comparison."""
         picture = getattr(self.comparison, side, None)
         same = (k for k, v in self.images.items() if picture is not None and np.array_equal(v, picture, True))
         return next(same, None)
 
-    def check(self):
+    def check(self) -> None:
         """Raise InputError when the pictures and the comparison are not of one shape."""
         shapes = {label: np.shape(image) for label, image in self.images.items()}
         if self.comparison is not None and "difference" in self.comparison.maps:
@@ -112,27 +113,31 @@ class Cell:
                 )
 
 
-def asset(name):
+def _name(key: str) -> str:
+    return LABELS[key][0] if key in LABELS else key
+
+
+def asset(name: str) -> str:
     """The text of a file of ``report/assets``."""
     return resources.files("btfref.report").joinpath("assets", name).read_text("utf-8")
 
 
-def label_of(key):
+def label_of(key: str) -> tuple[str, str]:
     """Name and meaning of a picture's label, for HTML."""
     name, meaning = LABELS.get(key, (key, ""))
     return escape(name), escape(meaning)
 
 
-def signed_difference(comparison):
+def signed_difference(comparison: Comparison) -> np.ndarray:
     """Per pixel the channel that differs most, with its sign, (H, W); 0 where a pixel is not finite."""
     clean = np.nan_to_num(comparison.maps["difference"].astype(np.float64))
     index = np.abs(clean).argmax(-1)[..., None]
     return np.take_along_axis(clean, index, -1)[..., 0]
 
 
-def full_scale(signed, classes):
+def full_scale(signed: np.ndarray, classes: np.ndarray | None) -> float:
     """A round number that 99.9 % of the differences stay below, of the interior where there is one."""
-    inside = np.abs(signed[classes == PixelClass.INTERIOR])
+    inside = np.abs(signed if classes is None else signed[classes == PixelClass.INTERIOR])
     size = inside[inside > 0] if inside.any() else np.abs(signed[signed != 0])
     if size.size == 0:
         return 1e-6
@@ -141,7 +146,7 @@ def full_scale(signed, classes):
     return float(power * next(step for step in (1, 2, 5, 10) if wanted <= step * power * (1 + 1e-9)))
 
 
-def script_json(data):
+def script_json(data: object) -> str:
     """JSON that may stand inside a ``<script>`` element; equal data give equal text."""
     text = json.dumps(json_safe(data), separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c")

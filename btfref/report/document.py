@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 
 from btfref.comparison.comparison import json_safe
 from btfref.errors import InputError
 from btfref.gates.tolerances import gate_table
-from btfref.report.cell import asset, script_json
+from btfref.report.cell import Cell, asset, script_json
 from btfref.report.overview import overview, verdict
 from btfref.report.stage import article
 from btfref.report.text import facts_list
+from btfref.types import Facts, PathLike
 
 
-def report_data(title, cells, facts):
+def report_data(title: str, cells: Sequence[Cell], facts: Facts) -> Facts:
     """The report as strict JSON: everything but the pixels.
 
     Parameters
@@ -52,7 +54,7 @@ def report_data(title, cells, facts):
     )
 
 
-def write_report(path, *, title, cells, facts):
+def write_report(path: PathLike, *, title: str, cells: Iterable[Cell], facts: Facts) -> Path:
     """Write a report that opens anywhere, and its numbers beside it.
 
     Parameters

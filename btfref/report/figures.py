@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Sequence
 from html import escape
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.conventions import PixelClass
 from btfref.images.png import encode_png
@@ -18,7 +20,7 @@ _WIDTH, _HEIGHT = 640, 252
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46, 10, 26, 40
 
 
-def thumbnail(encoded, *, size=72):
+def thumbnail(encoded: ArrayLike, *, size: int = 72) -> str:
     """A data URI of a small PNG by averaging blocks.
 
     Parameters
@@ -42,14 +44,14 @@ def thumbnail(encoded, *, size=72):
     return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
 
 
-def diverging(value):
+def diverging(value: ArrayLike) -> np.ndarray:
     """Blue, white and red of values in [-1, 1] → (..., 3) display-encoded; the page uses the same stops."""
     stops = np.array([[5, 48, 97], [67, 147, 195], [247, 247, 247], [214, 96, 77], [103, 0, 31]]) / 255
     position = np.clip(np.nan_to_num(np.asarray(value, np.float64)), -1, 1) * 2 + 2
     return np.stack([np.interp(position, np.arange(5), stops[:, c]) for c in range(3)], axis=-1)
 
 
-def error_histogram(relative, classes, marks):
+def error_histogram(relative: np.ndarray, classes: np.ndarray, marks: Sequence[tuple[str, float]]) -> str:
     """Distribution of the relative error per pixel class, both axes logarithmic.
 
     Parameters
@@ -76,13 +78,15 @@ def error_histogram(relative, classes, marks):
             series.append((kind.label, np.histogram(logs, edges)[0] / values.size))
     floor = -5.0  # log10 of the smallest share drawn: one pixel of 316 x 316
 
-    def x(log):
+    def x(log: float) -> float:
         return _LEFT + (log - low) / (high - low) * (_WIDTH - _LEFT - _RIGHT)
 
-    def y(log):
+    def y(log: float) -> float:
         return _TOP + (0 - log) / (0 - floor) * (_HEIGHT - _TOP - _BOTTOM)
 
-    lines, below, beside = [], [], []
+    lines: list[tuple[float, float, float, float]] = []
+    below: list[tuple[float, float, str]] = []
+    beside: list[tuple[float, float, str]] = []
     for decade in range(low, high + 1):
         lines.append((x(decade), _TOP, x(decade), y(floor)))
         below.append((x(decade), y(floor) + 15, "≤ 10⁻⁸" if decade == low else _power(decade)))
@@ -98,7 +102,7 @@ def error_histogram(relative, classes, marks):
             at = x(np.log10(value))
             parts.append(svg.lines("mark", [(at, _TOP - 4, at, y(floor))]))
             parts.append(svg.text(at + 4, _TOP - 6 + 12 * (index % 2), label, "start", "marklabel"))
-    legend_x = _LEFT + 4
+    legend_x = _LEFT + 4.0
     for name, _ in series:
         parts.append(f'<rect class="key {name}" x="{svg.short(legend_x)}" y="6" width="10" height="10"/>')
         parts.append(svg.text(legend_x + 15, 15, name, "start"))
@@ -107,7 +111,7 @@ def error_histogram(relative, classes, marks):
     return _svg(parts, "Share of pixels over relative error, by pixel class")
 
 
-def p_value_histogram(p_values):
+def p_value_histogram(p_values: np.ndarray) -> str:
     """Distribution of p-values, which is flat where nothing but noise differs.
 
     Parameters
@@ -142,11 +146,11 @@ def p_value_histogram(p_values):
     return _svg(parts, "Density of p-values")
 
 
-def _power(exponent):
+def _power(exponent: int) -> str:
     return "10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")) if exponent else "1"
 
 
-def _svg(parts, label):
+def _svg(parts: Sequence[str], label: str) -> str:
     return (
         f'<svg class="chart" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(label)}">'
         + "".join(parts)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 
-def plot_growth(rows, path):
+from btfref.types import Facts, PathLike
+
+
+def plot_growth(rows: Sequence[Facts], path: PathLike) -> None:
     """Draw time and memory against each quantity that was varied.
 
     Parameters

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 
-def plot_orders(entries, path):
+from btfref.types import Facts, PathLike
+
+
+def plot_orders(entries: Sequence[Facts], path: PathLike) -> None:
     """Error against the order of spherical harmonics, one line an environment.
 
     Parameters

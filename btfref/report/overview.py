@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from html import escape
 
 from btfref.conventions import PixelClass
-from btfref.gates.verdicts import limit_name
-from btfref.report.cell import full_scale, label_of, signed_difference
+from btfref.gates.verdicts import GateResult, limit_name
+from btfref.report.cell import Cell, full_scale, label_of, signed_difference
 from btfref.report.figures import diverging, thumbnail
 from btfref.report.text import badge, number
 
@@ -14,7 +15,7 @@ from btfref.report.text import badge, number
 SHOWN = {"ΔE00": "delta_e00_mean", "FLIP": "flip_mean", "RMSE / mean": "nrmse"}
 
 
-def verdict(cells):
+def verdict(cells: Sequence[Cell]) -> str:
     """One line on all cells.
 
     Parameters
@@ -38,7 +39,7 @@ def verdict(cells):
     return f'<p class="verdict {worst}"><strong>{word}</strong><span>{counts}</span></p>'
 
 
-def overview(cells):
+def overview(cells: Sequence[Cell]) -> str:
     """Cells by gates, each value coloured by its outcome.
 
     Parameters
@@ -51,7 +52,7 @@ def overview(cells):
         A ``<table>`` in a box that scrolls sideways.
     """
     gates = {gate.name: gate for cell in cells for gate in cell.all_gates}
-    groups = {}
+    groups: dict[str, list[GateResult]] = {}
     for gate in gates.values():
         groups.setdefault(gate.gate, []).append(gate)
     names = {key: escape(key).replace(".", ".<wbr>") for key in groups}
@@ -75,7 +76,7 @@ def overview(cells):
     )
 
 
-def _row(index, cell, columns):
+def _row(index: int, cell: Cell, columns: Sequence[str]) -> str:
     found = {gate.name: gate for gate in cell.all_gates}
     values = []
     for name in columns:
@@ -92,7 +93,7 @@ def _row(index, cell, columns):
     return f'<tr><th scope="row">{link}</th><td>{badge(cell.outcome)}</td>{"".join(values)}</tr>'
 
 
-def _thumbnails(cell):
+def _thumbnails(cell: Cell) -> str:
     """The first two pictures and their signed difference."""
     if not cell.images:
         return ""

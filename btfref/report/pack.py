@@ -6,11 +6,14 @@ import base64
 import zlib
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from btfref.types import Facts
 
 _LARGEST = 32768.0
 
 
-def pack(values, *, bits=8, base=None):
+def pack(values: ArrayLike, *, bits: int = 8, base: tuple[str, ArrayLike] | None = None) -> Facts:
     """Numbers for the page: scaled half floats with a shortened mantissa, deflated, base64.
 
     Parameters
@@ -30,20 +33,22 @@ def pack(values, *, bits=8, base=None):
         ``width``, ``height``, ``channels``; ``scale`` to multiply by; ``drop``, the bits to shift back;
         ``delta``, whether rows hold differences from pixel to pixel; ``data``; ``base``, the label, where it is used.
     """
-    values = np.asarray(values, np.float64)
-    values = values[..., None] if values.ndim == 2 else values
-    scale = _scale(values)
+    pixels = np.asarray(values, np.float64)
+    pixels = pixels[..., None] if pixels.ndim == 2 else pixels
+    scale, other = _scale(pixels), None
     if base is not None:
-        label, other = base[0], np.reshape(np.asarray(base[1], np.float64), values.shape)
+        other = np.reshape(np.asarray(base[1], np.float64), pixels.shape)
         # The base's scale, so that equal values have equal bits; half floats leave room for twice its largest.
-        base = label if scale < 1.9 * _scale(other) else None
-        scale = _scale(other) if base else scale
-    code = _codes(values, scale, bits)
-    if base is not None:
+        if scale < 1.9 * _scale(other):
+            scale = _scale(other)
+        else:
+            base = other = None
+    code = _codes(pixels, scale, bits)
+    if other is not None:
         code = code ^ _codes(other, scale, bits)
     difference = np.diff(code, axis=-1, prepend=np.uint16(0))  # wraps, and so does the sum that undoes it
     plain, delta = (_deflate(x) for x in (code, difference))
-    height, width, channels = values.shape
+    height, width, channels = pixels.shape
     return {
         "width": width,
         "height": height,
@@ -52,27 +57,27 @@ def pack(values, *, bits=8, base=None):
         "drop": 10 - bits,
         "delta": len(delta) < len(plain),
         "data": base64.b64encode(min(plain, delta, key=len)).decode("ascii"),
-        **({"base": base} if base is not None else {}),
+        **({"base": base[0]} if base is not None else {}),
     }
 
 
-def pack_text(text):
+def pack_text(text: str) -> str:
     """Text, deflated, base64: HTML becomes a quarter to a half of its size."""
     return base64.b64encode(zlib.compress(text.encode("utf-8"), 9)).decode("ascii")
 
 
-def unpack_text(packed):
+def unpack_text(packed: str) -> str:
     """What the page makes of :func:`pack_text`'s result."""
     return zlib.decompress(base64.b64decode(packed)).decode("utf-8")
 
 
-def _scale(values):
+def _scale(values: np.ndarray) -> float:
     """Largest finite value as half floats have it best."""
     largest = float(np.max(np.abs(values), where=np.isfinite(values), initial=0.0))
     return largest / _LARGEST or 1.0  # also where the quotient underflows
 
 
-def _codes(values, scale, bits):
+def _codes(values: np.ndarray, scale: float, bits: int) -> np.ndarray:
     """Shortened half floats, (C, H, W) uint16."""
     drop = 10 - bits
     half = np.where(np.isfinite(values), values / scale, np.nan).astype(np.float16)
@@ -80,7 +85,7 @@ def _codes(values, scale, bits):
     return np.moveaxis(code.astype(np.uint16), -1, 0)
 
 
-def unpack(packed, base=None):
+def unpack(packed: Facts, base: Facts | None = None) -> np.ndarray:
     """What the page makes of `pack`'s result.
 
     Parameters
@@ -100,7 +105,7 @@ def unpack(packed, base=None):
     return np.moveaxis(half.astype(np.float64) * packed["scale"], 0, -1)
 
 
-def _decoded(packed):
+def _decoded(packed: Facts) -> np.ndarray:
     """The codes as they are stored, (C, H, W) uint16."""
     raw = np.frombuffer(zlib.decompress(base64.b64decode(packed["data"])), np.uint8).astype(np.uint16)
     high, low = raw.reshape(2, packed["channels"], packed["height"], packed["width"])
@@ -108,7 +113,7 @@ def _decoded(packed):
     return np.cumsum(code, axis=-1, dtype=np.uint16) if packed["delta"] else code
 
 
-def _deflate(code):
+def _deflate(code: np.ndarray) -> bytes:
     """High bytes, then low bytes: the high ones repeat."""
     planes = np.concatenate([(code >> 8).astype(np.uint8).ravel(), (code & 255).astype(np.uint8).ravel()])
     return zlib.compress(planes.tobytes(), 9)

@@ -6,11 +6,21 @@ another is at most as large in both costs and smaller in one.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from btfref.errors import InputError
+from btfref.types import PathLike
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
+    from matplotlib.transforms import Bbox
+
 
 #: Colours (Okabe and Ito 2008: told apart by the colour-blind) and markers of groups, in their order; as their numbers
 #: differ by one, 56 groups look different.
@@ -53,7 +63,7 @@ class Panel:
     points: list[Point] = field(default_factory=list)
 
 
-def front(points):
+def front(points: Sequence[Point]) -> np.ndarray:
     """Which points no other one dominates.
 
     Parameters
@@ -79,10 +89,10 @@ def front(points):
         )
     no_worse = (cost[:, None] <= cost[None]).all(-1)
     better = (cost[:, None] < cost[None]).any(-1)
-    return ~(no_worse & better).any(0)
+    return np.logical_not((no_worse & better).any(0))
 
 
-def pareto_table(panel):
+def pareto_table(panel: Panel) -> list[str]:
     """The points of a panel as a table in Markdown, by the first cost; what stands on the front is bold.
 
     Parameters
@@ -113,7 +123,7 @@ def pareto_table(panel):
     return ["| " + " | ".join(cells) + " |" for cells in lines]
 
 
-def draw_pareto(panels, path):
+def draw_pareto(panels: Sequence[Panel], path: PathLike | IO[Any]) -> None:
     """Write panels as one picture: up to three side by side, more of them in rows of two.
 
     Parameters
@@ -131,7 +141,7 @@ def draw_pareto(panels, path):
     _figure(panels).savefig(path, dpi=150)
 
 
-def pareto_svg(panels):
+def pareto_svg(panels: Sequence[Panel]) -> str:
     """The same picture as an ``<svg>`` element, to be set into a page.
 
     Returns
@@ -150,7 +160,7 @@ def pareto_svg(panels):
     return whole[whole.index("<svg") :].strip()
 
 
-def _figure(panels):
+def _figure(panels: Sequence[Panel]) -> Figure:
     from matplotlib.figure import Figure
 
     groups = list(dict.fromkeys(p.group for panel in panels for p in panel.points))
@@ -179,7 +189,7 @@ def _figure(panels):
     return figure
 
 
-def _draw(axis, panel, groups):
+def _draw(axis: Axes, panel: Panel, groups: Sequence[str]) -> list[tuple[Point, bool]]:
     """Points and the front of a panel; returns what there is to name."""
     best = front(panel.points)
     x, y = (np.array([getattr(p, c) for p in panel.points]) for c in "xy")
@@ -194,7 +204,7 @@ def _draw(axis, panel, groups):
                 continue
             opacity = 1 if best[i] else DIM
             axis.plot(p.x, p.y, marker, color=colour, ms=6, alpha=opacity, mec="none", zorder=3)
-            if p.low is not None:
+            if p.low is not None and p.high is not None:
                 axis.plot([p.x, p.x], [p.low, p.high], "-", color=colour, alpha=opacity, lw=1.2, zorder=2)
         axis.plot([], [], marker, color=colour, ms=6, mec="none", label=group or "all")
     axis.margins(0.12)
@@ -206,7 +216,7 @@ def _draw(axis, panel, groups):
     return [(p, bool(b)) for p, b in zip(panel.points, best, strict=True)]
 
 
-def name_ticks(axis, values):
+def name_ticks(axis: Axis, values: np.ndarray) -> None:
     """Plain numbers at 1, 2 and 5 where costs span less than two decades; powers of ten alone otherwise."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
@@ -216,10 +226,10 @@ def name_ticks(axis, values):
     axis.set_minor_formatter(NullFormatter())
 
 
-def _place_names(axis, marks):
+def _place_names(axis: Axes, marks: Sequence[tuple[Point, bool]]) -> None:
     """Write names beside their points, each at the first place where it covers nothing else."""
     frame = axis.get_window_extent()
-    taken = [_box(*axis.transData.transform((p.x, p.y)), 4, 4) for p, _ in marks]
+    taken = [_around(axis, p) for p, _ in marks]
     # Names on the front choose first.
     for p, best in sorted(marks, key=lambda mark: not mark[1]):
         label = axis.annotate(
@@ -234,18 +244,22 @@ def _place_names(axis, marks):
         )
         for place in _PLACES:
             label.xyann = place
-            label.set_ha("left" if place[0] > 0 else "right" if place[0] < 0 else "center")
-            label.set_va("center" if abs(place[1]) < 1 else "bottom" if place[1] > 0 else "top")
+            label.set_horizontalalignment("left" if place[0] > 0 else "right" if place[0] < 0 else "center")
+            label.set_verticalalignment(
+                "center" if abs(place[1]) < 1 else "bottom" if place[1] > 0 else "top"
+            )
             box = label.get_window_extent()
             inside = frame.x0 <= box.x0 and box.x1 <= frame.x1 and frame.y0 <= box.y0 and box.y1 <= frame.y1
-            own = _box(*axis.transData.transform((p.x, p.y)), 4, 4)
+            own = _around(axis, p)
             others = [t for t in taken if not np.allclose(t.extents, own.extents)]
             if inside and not any(box.overlaps(other) for other in others):
                 break
         taken.append(label.get_window_extent())
 
 
-def _box(x, y, half_width, half_height):
+def _around(axis: Axes, point: Point, half: float = 4) -> Bbox:
+    """The square on the page that a point covers."""
     from matplotlib.transforms import Bbox
 
-    return Bbox.from_extents(x - half_width, y - half_height, x + half_width, y + half_height)
+    x, y = axis.transData.transform((point.x, point.y))
+    return Bbox.from_extents(x - half, y - half, x + half, y + half)

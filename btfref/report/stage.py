@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from html import escape
 
 import numpy as np
 
+from btfref.comparison.comparison import Comparison
 from btfref.conventions import PixelClass
 from btfref.gates.verdicts import limit_name
-from btfref.report.cell import LABELS, asset, full_scale, label_of, script_json, signed_difference
+from btfref.report.cell import LABELS, Cell, asset, full_scale, label_of, script_json, signed_difference
 from btfref.report.figures import error_histogram, p_value_histogram
 from btfref.report.pack import pack
 from btfref.report.text import badge, class_table, gate_list, number
+from btfref.types import Facts
 
 
-def article(index, cell, *, extra="", images=None, bits=6):
+def article(
+    index: int, cell: Cell, *, extra: str = "", images: Mapping[str, Facts] | None = None, bits: int = 6
+) -> str:
     """The cell's part of the page.
 
     Parameters
@@ -56,7 +61,7 @@ def article(index, cell, *, extra="", images=None, bits=6):
     return "".join(parts)
 
 
-def _remarks(comparison):
+def _remarks(comparison: Comparison | None) -> str:
     """Pixels that need attention, and the constants behind the numbers."""
     if comparison is None:
         return ""
@@ -84,14 +89,14 @@ def _remarks(comparison):
     return f'<ul class="counts">{"".join(found)}</ul>' if found else ""
 
 
-def _stage(index, cell, packed, bits):
+def _stage(index: int, cell: Cell, packed: Mapping[str, Facts] | None, bits: int) -> str:
     """Viewer, maps and charts of a cell with pictures."""
     limits = [
         (f"{gate.gate.rpartition('.')[2]}, {limit_name(gate.entry)}".replace("_", " "), gate.limit)
         for gate in cell.all_gates
         if gate.entry in ("p50", "p99", "p999", "max")
     ]
-    pixels = {
+    pixels: Facts = {
         "stops": cell.display.stops,
         "limits": [limit for _, limit in limits],
         "images": {
@@ -123,14 +128,14 @@ def _stage(index, cell, packed, bits):
     )
 
 
-def _options(cell, chosen):
+def _options(cell: Cell, chosen: str) -> str:
     return "".join(
         f'<option value="{escape(key)}"{" selected" if key == chosen else ""}>{label_of(key)[0]}</option>'
         for key in cell.images
     )
 
 
-def _maps(comparison, bits):
+def _maps(comparison: Comparison, bits: int) -> Facts:
     """Errors per pixel for the page; in the order in which it shows them."""
     signed = signed_difference(comparison)
     finite = np.isfinite(comparison.maps["difference"]).all(-1)
@@ -138,13 +143,16 @@ def _maps(comparison, bits):
     for name in ("relative", "flip", "delta_e00"):
         if name in comparison.maps:
             maps[name] = pack(comparison.maps[name], bits=bits)
-    maps["classes"] = pack(comparison.classes, bits=4)
+    if comparison.classes is not None:
+        maps["classes"] = pack(comparison.classes, bits=4)
     if "p_value" in comparison.maps:
         maps["p_value"] = pack(np.nan_to_num(comparison.maps["p_value"], nan=1.0).min(-1), bits=4)
     return {"maps": maps, "full_scale": full_scale(signed, comparison.classes)}
 
 
-def _charts(comparison, limits):
+def _charts(comparison: Comparison, limits: Sequence[tuple[str, float]]) -> list[tuple[str, str]]:
+    if comparison.classes is None:
+        return []
     charts = [("Relative errors", error_histogram(comparison.maps["relative"], comparison.classes, limits))]
     if "p_value" in comparison.maps:
         shown = comparison.maps["p_value"][comparison.classes != PixelClass.BACKGROUND]

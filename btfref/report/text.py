@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
 from html import escape
+from typing import TYPE_CHECKING, Any
 
 from btfref.conventions import PixelClass
-from btfref.gates.verdicts import limit_name
+from btfref.gates.verdicts import GateResult, limit_name
+from btfref.types import Facts
+
+if TYPE_CHECKING:
+    from btfref.comparison import Comparison
+
 
 OUTCOME = {
     "pass": ("✓", "pass"),
@@ -42,7 +49,7 @@ ROWS = {
 }
 
 
-def number(value, digits=3):
+def number(value: float | str | None, digits: int = 3) -> str:
     """A number for a reader: three significant digits, exponents without padding; text and None pass.
 
     Parameters
@@ -75,7 +82,7 @@ def number(value, digits=3):
     return f"{mantissa}e{int(exponent)}".replace("-", "−")
 
 
-def badge(outcome, text=None):
+def badge(outcome: str, text: str | None = None) -> str:
     """A coloured word with a sign, so that colour is not needed to read it."""
     sign, word = OUTCOME[outcome]
     return (
@@ -83,7 +90,7 @@ def badge(outcome, text=None):
     )
 
 
-def class_table(comparison, pictures=""):
+def class_table(comparison: Comparison, pictures: str = "") -> str:
     """Metrics by pixel class.
 
     Parameters
@@ -123,16 +130,18 @@ def class_table(comparison, pictures=""):
             cells = "".join(_interval(comparison.statistics.get(name, {}).get(key)) for name in order)
             body.append(f'<tr><th scope="row" title="{escape(explanation)}">{label}</th>{cells}</tr>')
     if comparison.statistics:
-        cells = []
+        found_cells = []
         for name in order:
             found = comparison.statistics.get(name, {}).get("difference")
-            cells.append(
+            found_cells.append(
                 f"<td>{number(found['rejected'])} of {number(found['n_tests'])}</td>"
                 if found
                 else "<td>–</td>"
             )
         title = "channels whose equality the z-test rejects after Šidák's correction"
-        body.append(f'<tr><th scope="row" title="{title}">significant differences</th>{"".join(cells)}</tr>')
+        body.append(
+            f'<tr><th scope="row" title="{title}">significant differences</th>{"".join(found_cells)}</tr>'
+        )
     return (
         '<div class="scroll"><table class="metrics">'
         f"<caption>Errors of linear radiance by pixel class{': ' if pictures else ''}{escape(pictures)}</caption>"
@@ -141,13 +150,13 @@ def class_table(comparison, pictures=""):
     )
 
 
-def _interval(found):
+def _interval(found: Facts | None) -> str:
     if not found:
         return "<td>–</td>"
     return f"<td>{number(found['low'], 2)} to {number(found['high'], 2)}</td>"
 
 
-def gate_list(gates):
+def gate_list(gates: Iterable[GateResult]) -> str:
     """Gates with value, limit and outcome, grouped, each group with its reason.
 
     Parameters
@@ -158,7 +167,7 @@ def gate_list(gates):
     -------
     str
     """
-    groups = {}
+    groups: dict[str, list[GateResult]] = {}
     for gate in gates:
         groups.setdefault(gate.gate, []).append(gate)
     parts = []
@@ -184,7 +193,7 @@ def gate_list(gates):
     return "".join(parts) or '<p class="muted">No gate was applied.</p>'
 
 
-def facts_list(facts):
+def facts_list(facts: Facts) -> str:
     """Nested facts as definition lists; lists of text as preformatted lines.
 
     Parameters
@@ -211,7 +220,7 @@ def facts_list(facts):
     return "".join(parts)
 
 
-def _definitions(table):
+def _definitions(table: Mapping[str, Any]) -> str:
     rows = []
     for key, value in table.items():
         if isinstance(value, dict):
@@ -224,11 +233,13 @@ def _definitions(table):
     return f"<dl>{''.join(rows)}</dl>"
 
 
-def _plain(value):
-    if value is None or isinstance(value, bool):
-        return {None: "–", True: "yes", False: "no"}[value]
+def _plain(value: object) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _words(key):
+def _words(key: object) -> str:
     return str(key).replace("_", " ")

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from btfref.gates.verdicts import with_class
+import numpy as np
+
+from btfref.gates.verdicts import GateResult, with_class
 from btfref.report.cell import Cell, asset, script_json
 from btfref.report.figures import thumbnail
 from btfref.report.pack import pack, pack_text
@@ -15,15 +19,19 @@ from btfref.report.pareto import Panel, Point, pareto_svg
 from btfref.report.stage import article
 from btfref.report.text import badge, facts_list, gate_list, number
 from btfref.report.waterfall_figure import waterfall_section
-from btfref.validate.cell import gate_from
-from btfref.validate.run import method_name
+from btfref.types import Facts, PathLike, Progress
+from btfref.validate.cell import CellResult, gate_from
+from btfref.validate.run import Validation, method_name
 from btfref.validate.summary import HEADER, additivity, rows
+
+if TYPE_CHECKING:
+    from btfref.validate.self_test import Caught
 
 #: Mantissa bits of pictures and of error maps on the pages: enough for eyes, and little to store.
 PICTURE_BITS, MAP_BITS = 6, 4
 
 #: What the matrix can show: label → number of a cell's facts, or None.
-SHOWN = {
+SHOWN: dict[str, Callable[[Facts], float | None]] = {
     "outcome": lambda facts: None,
     "whole, RMSE / mean": lambda facts: _relative(facts, "total"),
     "fit, RMSE / mean": lambda facts: _relative(facts, "fit"),
@@ -33,7 +41,13 @@ SHOWN = {
 }
 
 
-def write_validation(folder, result, *, self_test=None, progress=None):
+def write_validation(
+    folder: PathLike,
+    result: Validation,
+    *,
+    self_test: Sequence[Caught] | None = None,
+    progress: Progress | None = None,
+) -> Path:
     """Write the report.
 
     Parameters
@@ -69,13 +83,13 @@ def write_validation(folder, result, *, self_test=None, progress=None):
     return folder / "index.html"
 
 
-def slug(facts):
+def slug(facts: Facts) -> str:
     """Name of a cell's page."""
     words = (facts["mesostructure"], facts["method"], facts["scene"], facts["lights"])
     return "-".join("".join(c if c.isalnum() or c in "_." else "_" for c in Path(str(w)).stem) for w in words)
 
 
-def _rounded(value, digits=6):
+def _rounded(value: Any, digits: int = 6) -> Any:
     """JSON-able data whose floats have so many digits."""
     if isinstance(value, float):
         return float(f"{value:.{digits}g}")
@@ -84,12 +98,12 @@ def _rounded(value, digits=6):
     return [_rounded(inner, digits) for inner in value] if isinstance(value, list | tuple) else value
 
 
-def _view(facts):
+def _view(facts: Facts) -> str:
     """What all methods' cells of a scene, its lights and a mesostructure share."""
     return "-".join(slug(facts | {"method": ""}).split("--"))
 
 
-def _shared_pictures(folder, result):
+def _shared_pictures(folder: Path, result: Validation) -> None:
     """The truth, and the pixel classes, once for all methods."""
     for cell in result.cells:
         path = folder / "assets" / f"{_view(cell.facts)}.js"
@@ -100,7 +114,7 @@ def _shared_pictures(folder, result):
             )
 
 
-def _packed(images):
+def _packed(images: Mapping[str, np.ndarray]) -> dict[str, Facts]:
     """Pictures for a page: the truth by name, real time by what differs from the reference."""
     packed = {"truth": {"shared": "truth"}} if "truth" in images else {}
     if "reference" in images:
@@ -112,7 +126,7 @@ def _packed(images):
     return {name: packed[name] for name in sorted(packed, key=lambda n: n != "reference")}
 
 
-def _cell_page(folder, result, index):
+def _cell_page(folder: Path, result: Validation, index: int) -> str:
     """Write a cell's page; returns a thumbnail of its picture, or nothing."""
     made, facts = result.cells[index], result.cells[index].facts
     comparison = made.comparison()
@@ -144,7 +158,7 @@ def _cell_page(folder, result, index):
     return thumbnail(cell.display.encoded(images["reference"]), size=28) if images else ""
 
 
-def _page(**slots):
+def _page(**slots: str) -> str:
     head, *rest = asset("page.html").split("{{")
     slots["title"] = escape(slots["title"])
     for part in rest:
@@ -153,7 +167,9 @@ def _page(**slots):
     return head
 
 
-def _index(folder, result, self_test, thumbnails):
+def _index(
+    folder: Path, result: Validation, self_test: Sequence[Caught] | None, thumbnails: Mapping[str, str]
+) -> None:
     outcomes = [cell.outcome for cell in result.cells]
     failed = result.failed_gates
     kind, word = ("pass", "All gates pass") if result.passed else ("fail", "Gates fail")
@@ -190,7 +206,7 @@ def _index(folder, result, self_test, thumbnails):
     (folder / "index.html").write_text(page, "utf-8")
 
 
-def _relative(facts, stage):
+def _relative(facts: Facts, stage: str) -> float | None:
     fall = facts["waterfall"]
     if not fall or not fall["mean"]:
         return None
@@ -200,12 +216,12 @@ def _relative(facts, stage):
     return found[0] / fall["mean"] if found else None
 
 
-def _whole_colour(facts):
+def _whole_colour(facts: Facts) -> float | None:
     fall = facts["waterfall"]
     return fall["stages"][-1]["delta_e00_so_far"]["estimate"] if fall else None
 
 
-def _matrix(result, thumbnails):
+def _matrix(result: Validation, thumbnails: Mapping[str, str]) -> str:
     """Methods by scenes and lights; what a cell shows is chosen above it."""
     cells = {
         (c.facts["mesostructure"], c.facts["method"], c.facts["scene"], c.facts["lights"]): c
@@ -242,7 +258,7 @@ def _matrix(result, thumbnails):
     )
 
 
-def _entry(cell, peaks, thumbnails):
+def _entry(cell: CellResult, peaks: Mapping[str, float], thumbnails: Mapping[str, str]) -> str:
     facts = cell.facts
     numbers = {name: show(facts) for name, show in SHOWN.items()}
     sign = {"pass": "✓", "fail": "✗", "inconclusive": "?"}[cell.outcome]
@@ -260,13 +276,13 @@ def _entry(cell, peaks, thumbnails):
     return f'<td class="{cell.outcome}" {attributes}>{link}{image}<span class="value">{sign}</span></a></td>'
 
 
-def _failures(failed):
+def _failures(failed: Iterable[tuple[str, GateResult]]) -> str:
     return (
         "<ul>" + "".join(f"<li>{escape(name)}: {escape(gate.line)}</li>" for name, gate in failed) + "</ul>"
     )
 
 
-def _table(header, body):
+def _table(header: Iterable[str], body: Iterable[Iterable[Any]]) -> str:
     head = "".join(f'<th scope="col">{escape(h)}</th>' for h in header)
     lines = "".join(
         "<tr>"
@@ -278,7 +294,7 @@ def _table(header, body):
     return f'<div class="scroll">{table}</div>'
 
 
-def _summary(result):
+def _summary(result: Validation) -> str:
     note = (
         "RMSE of each stage alone over the truth's mean, root mean square over the cells; ΔE00 of the whole; mean "
         "absolute error at held-out directions over the mean of the data."
@@ -286,7 +302,7 @@ def _summary(result):
     return _table(HEADER, rows(result)) + f'<p class="notes">{note}</p>'
 
 
-def _pareto(result):
+def _pareto(result: Validation) -> str:
     """Error of the fit against bytes, and of the whole against the time of a frame; a colour a mesostructure."""
     by_bytes, by_time = [], []
     for row in rows(result):
@@ -319,7 +335,7 @@ def _pareto(result):
     return f'<div class="pareto">{pareto_svg(panels)}</div><p class="notes">{note}</p>'
 
 
-def _methods(result):
+def _methods(result: Validation) -> str:
     parts = []
     for facts in result.methods:
         gates = [gate_from(gate) for gate in facts["gates"]]
@@ -339,7 +355,7 @@ def _methods(result):
     return "".join(parts)
 
 
-def _self_test(caught):
+def _self_test(caught: Sequence[Caught]) -> str:
     body = [
         [
             f.name,

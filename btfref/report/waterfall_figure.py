@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from html import escape
 
 import numpy as np
 
 from btfref.report import svg
 from btfref.report.text import number
+from btfref.types import Facts
 
 _WIDTH, _LEFT, _RIGHT, _TOP, _ROW = 760, 108, 132, 30, 34
 
@@ -15,7 +17,7 @@ _WIDTH, _LEFT, _RIGHT, _TOP, _ROW = 760, 108, 132, 30, 34
 DECADES = 8
 
 
-def waterfall_figure(fall):
+def waterfall_figure(fall: Facts) -> str:
     """Bars of RMSE on a logarithmic scale, one row a stage.
 
     Parameters
@@ -42,7 +44,7 @@ def waterfall_figure(fall):
     base = _TOP + _ROW * (len(rows) + 2)
     height = base + 30
 
-    def x(value):
+    def x(value: float) -> float:
         log = np.log10(value) if value > 0 else low
         return _LEFT + (np.clip(log, low, top) - low) / (top - low) * (_WIDTH - _LEFT - _RIGHT)
 
@@ -84,7 +86,7 @@ def waterfall_figure(fall):
     )
 
 
-def _magnitude(mse):
+def _magnitude(mse: Mapping[str, float]) -> dict[str, float]:
     """Interval of the root of a mean square's size, whatever its sign."""
     low, high = sorted(abs(mse[name]) for name in ("low", "high"))
     if mse["low"] < 0 < mse["high"]:
@@ -93,12 +95,14 @@ def _magnitude(mse):
     return {name: float(np.sqrt(value)) for name, value in ends.items()}
 
 
-def _signed_root(mse):
+def _signed_root(mse: float) -> str:
     """√ of a mean square with its sign, as text: what it adds to the whole, or takes from it."""
     return f"{'−' if mse < 0 else '+'}{number(float(np.sqrt(abs(mse))))} (root)"
 
 
-def _bar(x, interval, y, height, kind, low):
+def _bar(
+    x: Callable[[float], float], interval: Mapping[str, float], y: float, height: float, kind: str, low: float
+) -> str:
     """A bar to the estimate, and its interval as a whisker."""
     start, end = x(10.0**low), x(interval["estimate"])
     ends = [x(interval[name]) for name in ("low", "high")]
@@ -113,7 +117,7 @@ def _bar(x, interval, y, height, kind, low):
     )
 
 
-def waterfall_table(fall):
+def waterfall_table(fall: Facts) -> str:
     """The same numbers as a table, with intervals.
 
     Parameters
@@ -152,14 +156,14 @@ def waterfall_table(fall):
     )
 
 
-def _cell(interval):
+def _cell(interval: Mapping[str, float]) -> str:
     text = number(interval["estimate"])
     if interval["high"] > interval["low"]:
         text += f'<small class="muted"> {number(interval["low"], 2)} … {number(interval["high"], 2)}</small>'
     return f"<td>{text}</td>"
 
 
-def waterfall_section(fall):
+def waterfall_section(fall: Facts | None) -> str:
     """Figure, table and what they add up to, as HTML; empty without a waterfall."""
     if not fall:
         return ""
