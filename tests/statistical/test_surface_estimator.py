@@ -41,7 +41,7 @@ def test_image_means_equal_plain_renders(llvm, name):
     pairs = [(0, 1), (1, 3), (2, 2), (3, 0), (3, 3), (2, 1)]
     bias, noise = [], []
     for v, k in pairs:
-        image, variance = plain.pair(vectors[v], vectors[k], spp=64, rounds=16, seed=7 * v + k)
+        image, variance = plain.pair(vectors[v], vectors[k], spp=128, rounds=8, seed=7 * v + k)
         # Channels of a path go together; texels do not.
         spread = np.sqrt(3 * variance.sum()) / image.size
         bias.append(mean[v, k] / image.mean() - 1)
