@@ -237,7 +237,8 @@ _ROWS = (
         "Lafortune lobes times a table over views",
         "Daubert et al. 2001",
         "analytic.lafortune_lut",
-        image_light="LafortuneTable",
+        ports="lafortune",
+        image_light="Lafortune",
     ),
     _row(
         "cmf",

@@ -10,6 +10,7 @@ import mitsuba as mi
 from btfref.representations.factored.definition import FACTORS, index_slots, raised
 from mitsuba_plugins.lib.lookup import texel_stencil
 from mitsuba_plugins.lib.parabolic import ParabolicMaps, bilinear_stencil, half_difference, unpacked
+from mitsuba_plugins.lib.port import Port
 from mitsuba_plugins.lib.tables import as_float32, read_packets
 
 if TYPE_CHECKING:
@@ -17,14 +18,12 @@ if TYPE_CHECKING:
     from mitsuba_plugins.base import Maps
 
 
-class Evaluator:
+class Evaluator(Port):
     """Multiplies the maps that each texel's index names, and blends texels."""
 
     def __init__(self, maps: Maps) -> None:
-        self.shape, self.filter_type = maps.shape, maps.filter_type
-        self.constants = maps.meta["constants"]
-        self.slots = index_slots(self.constants)
-        self.update(maps)
+        self.slots = index_slots(maps.meta["constants"])
+        super().__init__(maps)
 
     def update(self, maps: Maps) -> None:
         """Take over changed maps."""

@@ -12,6 +12,7 @@ from btfref.numerics.sphere.frames import ROTATION_FLOOR
 from mitsuba_plugins.lib.heightfield import HeightField
 from mitsuba_plugins.lib.microfacets import HalfVectors, Microfacets
 from mitsuba_plugins.lib.parabolic import ParabolicMaps, bilinear_stencil, half_sum
+from mitsuba_plugins.lib.port import Port
 from mitsuba_plugins.lib.tables import as_float32
 
 if TYPE_CHECKING:
@@ -20,16 +21,11 @@ if TYPE_CHECKING:
     from mitsuba_plugins.lib.heightfield import Hit
 
 
-class Evaluator:
+class Evaluator(Port):
     """Marches to the surface, to the light, and evaluates the microfacet materials around the hit."""
 
     #: What samples light directions unless told otherwise; measured by ``btfref bench proposals``.
     sampling = "both"
-
-    def __init__(self, maps: Maps) -> None:
-        self.shape, self.filter_type = maps.shape, maps.filter_type
-        self.constants = maps.meta["constants"]
-        self.update(maps)
 
     def update(self, maps: Maps) -> None:
         """Take over changed maps."""

@@ -1,4 +1,4 @@
-"""Dr.Jit port of :mod:`btfref.representations.analytic.lafortune`."""
+"""Dr.Jit port of :mod:`btfref.representations.analytic.lafortune`, and of `lafortune_lut`, which has a factor too."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import drjit as dr
 import mitsuba as mi
 
 from btfref.numerics.powers import FLOOR
-from mitsuba_plugins.lib.analytic import held, packet, safe_power
+from mitsuba_plugins.lib.analytic import held, packet, safe_power, single
 from mitsuba_plugins.lib.lookup import texel_stencil
+from mitsuba_plugins.lib.port import Port
 from mitsuba_plugins.lib.proposals import CosineLobes
 
 if TYPE_CHECKING:
@@ -18,36 +19,43 @@ if TYPE_CHECKING:
     from mitsuba_plugins.lib.lookup import Neighbour
 
 
-class Evaluator:
-    """Evaluates the lobes of the neighbouring texels."""
+class Evaluator(Port):
+    """Evaluates the lobes of the neighbouring texels, times the interpolated factor of the view where there is one."""
 
     #: What samples light directions unless told otherwise; measured by ``btfref bench proposals``.
     sampling = "data"
 
-    def __init__(self, maps: Maps) -> None:
-        self.views = maps.views
-        self.shape, self.filter_type = maps.shape, maps.filter_type
-        constants = maps.meta["constants"]
-        self.light_edge, self.view_edge = constants["light_edge"], constants["view_edge"]
-        self.n_lobes = constants["n_lobes"]
-        self.update(maps)
-
     def update(self, maps: Maps) -> None:
         """Take over changed maps."""
+        self.n_lobes = self.constants["n_lobes"]
         self.width = maps.tensors["peaks"].shape[-1]
         self.lobes, self.peaks, self.colour = (
             mi.Float(maps.tensors[name].array) for name in ("lobes", "peaks", "colour")
         )
         dr.eval(self.lobes, self.peaks, self.colour)
+        self.factors: JitArray = None
+        if "factor" in maps.tensors:
+            self.factors, self.stride = (
+                mi.Float(maps.tensors["factor"].array),
+                maps.tensors["factor"].shape[-1],
+            )
+            dr.eval(self.factors)
 
     def factor(self, texel: JitArray, views: list[Neighbour], active: JitArray) -> JitArray:
-        """View-dependent factor of a texel: 1."""
-        return mi.Float(1)
+        """View-dependent factor of a texel; 1 where the method has none."""
+        if self.factors is None:
+            return mi.Float(1)
+        total = mi.Float(0)
+        for view, weight in single(views):
+            total = dr.fma(
+                dr.gather(mi.Float, self.factors, texel * self.stride + view, active), weight, total
+            )
+        return total
 
     def evaluate(self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray) -> JitArray:
         """B in 1/sr for valid directions; never negative."""
-        light, fade = held(w_light, self.light_edge)
-        v, _ = held(w_view, self.view_edge)
+        light, fade = held(w_light, self.constants["light_edge"])
+        v, _ = held(w_view, self.constants["view_edge"])
         product = light * v
         views = self.views.stencil(w_view)
         total = mi.Color3f(0)
@@ -64,7 +72,7 @@ class Evaluator:
 
     def proposal(self, uv: JitArray, w_view: JitArray, active: JitArray) -> CosineLobes:
         """The lobes of the nearest texel for the view, and its diffuse part; a common factor does not matter."""
-        v, _ = held(w_view, self.view_edge)
+        v, _ = held(w_view, self.constants["view_edge"])
         (texel,), _ = texel_stencil(uv, self.shape, "nearest")
         *_, diffuse = packet(dr.detach(self.colour), texel, 4, active)
         peaks = packet(dr.detach(self.peaks), texel, self.width, active)

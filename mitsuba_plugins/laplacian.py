@@ -13,6 +13,7 @@ from btfref.numerics.ycbcr import TO_RGB
 from mitsuba_plugins.lib.analytic import held, safe_power
 from mitsuba_plugins.lib.footprint import probes
 from mitsuba_plugins.lib.lookup import Neighbour, texel_stencil
+from mitsuba_plugins.lib.port import Port
 from mitsuba_plugins.lib.tables import PairTable, as_float32, read_packets
 
 if TYPE_CHECKING:
@@ -68,12 +69,11 @@ class Bands(PairTable):
         return total.plus(mi.Color3f(*colour) * weight)
 
 
-class Evaluator:
+class Evaluator(Port):
     """Sums the levels from ⌊λ⌋ on; finer ones are neither looked up nor computed."""
 
     def __init__(self, maps: Maps) -> None:
         constants = maps.meta["constants"]
-        self.views, self.lights, self.filter_type = maps.views, maps.lights, maps.filter_type
         self.nearest = bool(constants["nearest_directions"])
         self.counts = [int(constants[f"n_{name}"]) for name in ("y", "cb", "cr")]
         self.edges = constants["light_edge"], constants["view_edge"]
@@ -89,7 +89,7 @@ class Evaluator:
             np.array([[r, c, f, 0] for (r, c), f in zip(self.shapes, first, strict=True)]).ravel()
         )
         dr.eval(self.sizes)
-        self.update(maps)
+        super().__init__(maps)
 
     def update(self, maps: Maps) -> None:
         """Take over changed maps."""

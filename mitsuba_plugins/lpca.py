@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_plugins.lib.lookup import texel_stencil
+from mitsuba_plugins.lib.port import Port
 from mitsuba_plugins.lib.tables import PairTable, as_float32, read_packets
 
 if TYPE_CHECKING:
@@ -16,14 +17,8 @@ if TYPE_CHECKING:
     from mitsuba_plugins.lib.lookup import Neighbour
 
 
-class Evaluator:
+class Evaluator(Port):
     """Combines the interpolated mean and eigen-BRDFs of each texel's cluster."""
-
-    def __init__(self, maps: Maps) -> None:
-        self.views, self.lights = maps.views, maps.lights
-        self.shape, self.filter_type = maps.shape, maps.filter_type
-        self.n_components = maps.meta["constants"]["n_components"]
-        self.update(maps)
 
     def update(self, maps: Maps) -> None:
         """Take over changed maps."""
@@ -40,7 +35,7 @@ class Evaluator:
         # Not fetched without weight: a texel whose cluster is not kept holds no numbers.
         active = active & (share > 0)
         cluster = dr.gather(mi.UInt32, self.cluster, texel * self.cluster_stride, active)
-        weights = read_packets(self.weights, texel, self.width, active)[: self.n_components]
+        weights = read_packets(self.weights, texel, self.width, active)[: self.constants["n_components"]]
         return cluster, [mi.Float(share), *(mi.Float(w) * share for w in weights)]
 
     def evaluate(self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray) -> JitArray:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import mitsuba as mi
 
 from mitsuba_plugins.lib.lookup import texel_stencil
+from mitsuba_plugins.lib.port import Port
 from mitsuba_plugins.lib.tables import PairTable
 
 if TYPE_CHECKING:
@@ -14,13 +15,8 @@ if TYPE_CHECKING:
     from mitsuba_plugins.base import Maps
 
 
-class Evaluator:
+class Evaluator(Port):
     """Interpolates the table of a ``raw`` BTF."""
-
-    def __init__(self, maps: Maps) -> None:
-        self.views, self.lights = maps.views, maps.lights
-        self.shape, self.filter_type = maps.shape, maps.filter_type
-        self.update(maps)
 
     def update(self, maps: Maps) -> None:
         """Take over changed maps."""

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from mitsuba_plugins.lib.analytic import held, packet, parabolic_axis, single, unit_lobe
 from mitsuba_plugins.lib.lookup import texel_stencil
+from mitsuba_plugins.lib.port import Port
 from mitsuba_plugins.lib.proposals import CosineLobes
 
 if TYPE_CHECKING:
@@ -16,28 +17,22 @@ if TYPE_CHECKING:
     from mitsuba_plugins.base import Maps
 
 
-class Evaluator:
+class Evaluator(Port):
     """Evaluates the lobes of the neighbouring texels and views."""
 
     #: What samples light directions unless told otherwise; measured by ``btfref bench proposals``.
     sampling = "both"
 
-    def __init__(self, maps: Maps) -> None:
-        self.views, self.n_views = maps.views, maps.tensors["lobes"].shape[2]
-        self.shape, self.filter_type = maps.shape, maps.filter_type
-        constants = maps.meta["constants"]
-        self.edge, self.n_lobes = constants["light_edge"], constants["n_lobes"]
-        self.update(maps)
-
     def update(self, maps: Maps) -> None:
         """Take over changed maps."""
+        self.n_lobes, self.n_views = self.constants["n_lobes"], maps.tensors["lobes"].shape[2]
         self.lobes = mi.Float(maps.tensors["lobes"].array)
         self.colour = mi.Float(maps.tensors["colour"].array)
         dr.eval(self.lobes, self.colour)
 
     def evaluate(self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray) -> JitArray:
         """B in 1/sr for valid directions; never negative."""
-        light, fade = held(w_light, self.edge)
+        light, fade = held(w_light, self.constants["light_edge"])
         views = single(self.views.stencil(w_view))
         total = mi.Color3f(0)
         for texel, share in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True):

@@ -9,30 +9,26 @@ import mitsuba as mi
 
 from mitsuba_plugins.lib.analytic import held, packet, single
 from mitsuba_plugins.lib.lookup import texel_stencil
+from mitsuba_plugins.lib.port import Port
 
 if TYPE_CHECKING:
     from btfref.types import JitArray
     from mitsuba_plugins.base import Maps
 
 
-class Evaluator:
+class Evaluator(Port):
     """Evaluates the polynomials of the neighbouring texels and views."""
-
-    def __init__(self, maps: Maps) -> None:
-        self.views, self.n_views = maps.views, maps.tensors["polynomial"].shape[2]
-        self.shape, self.filter_type = maps.shape, maps.filter_type
-        self.edge = maps.meta["constants"]["light_edge"]
-        self.update(maps)
 
     def update(self, maps: Maps) -> None:
         """Take over changed maps."""
+        self.n_views = maps.tensors["polynomial"].shape[2]
         self.polynomial = mi.Float(maps.tensors["polynomial"].array)
         self.chroma = mi.Float(maps.tensors["chroma"].array)
         dr.eval(self.polynomial, self.chroma)
 
     def evaluate(self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray) -> JitArray:
         """B in 1/sr for valid directions; may be negative."""
-        light, fade = held(w_light, self.edge)
+        light, fade = held(w_light, self.constants["light_edge"])
         terms = [light.x * light.x, light.y * light.y, light.x * light.y, light.x, light.y, light.z * light.z]
         views = single(self.views.stencil(w_view))
         total = mi.Color3f(0)

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_plugins.lib.lookup import texel_stencil
+from mitsuba_plugins.lib.port import Port
 from mitsuba_plugins.lib.tables import PairTable, as_float32, read_packets
 
 if TYPE_CHECKING:
@@ -15,14 +16,8 @@ if TYPE_CHECKING:
     from mitsuba_plugins.base import Maps
 
 
-class Evaluator:
+class Evaluator(Port):
     """Combines the interpolated basis with the texels' weights."""
-
-    def __init__(self, maps: Maps) -> None:
-        self.views, self.lights = maps.views, maps.lights
-        self.shape, self.filter_type = maps.shape, maps.filter_type
-        self.n_components = maps.meta["constants"]["n_components"]
-        self.update(maps)
 
     def update(self, maps: Maps) -> None:
         """Take over changed maps."""
@@ -40,6 +35,6 @@ class Evaluator:
             mi.UInt32(0),
             self.views.stencil(w_view),
             self.lights.stencil(w_light, hold=False),
-            coefficient[: self.n_components],
+            coefficient[: self.constants["n_components"]],
             active,
         )

@@ -41,6 +41,26 @@ def texel_groups(tables: np.ndarray, n_groups: int = N_GROUPS) -> np.ndarray:
     return labels.astype(np.uint32)
 
 
+def spread_members(labels: np.ndarray, most: int) -> np.ndarray:
+    """Some members of each group, evenly spread, so that a large group is not judged by its first rows.
+
+    Parameters
+    ----------
+    labels : ndarray of int, shape (n,)
+    most : int
+        At most so many of each.
+
+    Returns
+    -------
+    ndarray of int
+        Indices of the members, group after group.
+    """
+    order = np.argsort(labels, kind="stable")
+    rank = np.arange(len(labels)) - np.searchsorted(labels[order], labels[order])
+    spacing = np.maximum(np.bincount(labels)[labels[order]] // most, 1)
+    return order[(rank % spacing == 0) & (rank // spacing < most)]
+
+
 def group_means(labels: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Mean of the rows of each group; groups without members get zeros.
 

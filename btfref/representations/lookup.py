@@ -239,6 +239,29 @@ def stored(name: str, array: np.ndarray, storage: str) -> np.ndarray:
     return array.astype(STORAGE[storage])
 
 
+def unit_peaks(axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Axes scaled to a peak of 1: half floats then spend their range on the shape, weights on the amount.
+
+    Parameters
+    ----------
+    axes : ndarray, shape (..., d)
+
+    Returns
+    -------
+    axes : ndarray, shape (..., d)
+    peak : ndarray, shape (...)
+        What the weights are to be multiplied by.
+    """
+    peak = np.maximum(np.abs(axes).max(-1, initial=0), np.finfo(np.float32).tiny)
+    return axes / peak[..., None], peak
+
+
+def refuse_not_finite(values: np.ndarray, btf: SampledBTF) -> None:
+    """InputError for samples of a BTF that are not finite."""
+    if not np.isfinite(values).all():
+        raise InputError("the BTF holds a value that is not finite", file=btf.path)
+
+
 def positive_integer(name: str, value: object) -> int:
     """``value`` as an int of at least 1.
 

@@ -1,4 +1,4 @@
-// Provides btf_environment of Lafortune lobes per texel: radiance under a prefiltered environment.
+// Provides btf_environment of Lafortune lobes per texel, times their factor of the view: radiance under a prefiltered environment.
 // Expects what representations/lafortune.glsl and lib/light/environment.glsl expect.
 
 #include "representations/lafortune.glsl"
@@ -10,6 +10,7 @@ vec3 btf_prefiltered(vec2 uv, vec3 w_view, mat3 to_world) {
         return vec3(0.0);
     }
     Stencil texels = texel_stencil(uv, COLOUR_DIM0, COLOUR_DIM1);
+    Stencil views = factor_views(w_view);
     float unused;
     vec3 view = held(w_view, VIEW_EDGE, unused);
     vec3 sum = vec3(0.0);
@@ -18,7 +19,8 @@ vec3 btf_prefiltered(vec2 uv, vec3 w_view, mat3 to_world) {
             continue;
         }
         vec4 own = table_fetch(colour, texels.index[x] * COLOUR_STRIDE);
-        sum += texels.weight[x] * own.rgb * lafortune_light(texels.index[x], own.a, view, to_world);
+        float visible = view_factor(texels.index[x], views);
+        sum += texels.weight[x] * visible * own.rgb * lafortune_light(texels.index[x], own.a, view, to_world);
     }
     return sum;
 }

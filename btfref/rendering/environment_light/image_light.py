@@ -88,7 +88,10 @@ class Lobes(_PrefilteredLobes):
 
 
 class Lafortune(_PrefilteredLobes):
-    """``lafortune``: for a view, lobes along ``C v`` times the light's cosine, which the share holds."""
+    """``lafortune``: for a view, lobes along ``C v`` times the light's cosine, which the share holds.
+
+    ``lafortune_lut``: times the factor of the view as well.
+    """
 
     SHADER = "environment/lafortune.glsl"
     cosine = True
@@ -115,12 +118,6 @@ class Lafortune(_PrefilteredLobes):
             return np.einsum("nt,ntc,ntc->nc", texel[1], value, flat["colour"][texel[0]][..., :3])
 
         return _evaluated(representation, kernel, uv, w_view, to_world)
-
-
-class LafortuneTable(Lafortune):
-    """``lafortune_lut``: the same times the factor of the view."""
-
-    SHADER = "environment/lafortune_lut.glsl"
 
 
 class Polynomials:

@@ -20,7 +20,7 @@ from btfref.numerics.solvers.levenberg import BatchFit, fit_batch
 from btfref.precision import real
 from btfref.representations.analytic import light_functions
 from btfref.representations.analytic.lobe_start import exponent_limit
-from btfref.representations.lookup import base_meta, direction_arrays, positive_integer, stored
+from btfref.representations.lookup import positive_integer, stored
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -284,13 +284,11 @@ def fit(
         return result, {}
 
     parameters = {"lobes": n_lobes, "storage": storage, "seed": seed}
-    maps, meta = fit_texels("lafortune", btf, fit_block, parameters, progress, storage, filter_type)
-    result = Representation(maps, meta)
-    meta["fit"]["epsilon"] = light_functions.fit_report(result, btf)
-    return result
+    return fit_texels(Representation, "lafortune", btf, fit_block, parameters, progress, storage, filter_type)
 
 
 def fit_texels(
+    made: type[light_functions.M],
     method: str,
     btf: SampledBTF,
     fit_block: Callable[[np.ndarray], tuple[BatchFit, dict[str, np.ndarray]]],
@@ -298,8 +296,8 @@ def fit_texels(
     progress: Progress | None,
     storage: str,
     filter_type: str,
-) -> tuple[dict[str, np.ndarray], Facts]:
-    """Maps and meta of a fit of one Lafortune model a texel.
+) -> light_functions.M:
+    """A representation from a fit of one Lafortune model a texel.
 
     Parameters
     ----------
@@ -319,9 +317,15 @@ def fit_texels(
     everything = BatchFit(
         *(np.concatenate([getattr(f, name) for f in fits]) for name in BatchFit.__dataclass_fields__)
     )
-    meta = base_meta(method, btf, parameters, filter_type=filter_type)
-    meta["constants"] = light_functions.edge_constants(btf) | {"n_lobes": parameters["lobes"]}
     failed = np.flatnonzero(~everything.converged)
-    memory = light_functions.memory_report(maps, rows * columns)
-    meta["fit"] = everything.summary | {"not_converged_at": failed[:1000].tolist(), "memory": memory}
-    return maps | direction_arrays(btf.views, btf.lights), meta
+    return light_functions.finished(
+        made,
+        method,
+        btf,
+        maps,
+        parameters,
+        filter_type=filter_type,
+        constants={"n_lobes": parameters["lobes"]},
+        facts=everything.summary | {"not_converged_at": failed[:1000].tolist()},
+        by_view=False,
+    )

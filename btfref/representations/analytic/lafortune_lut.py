@@ -113,12 +113,9 @@ def fit(
         return result, {"factor": factor.T}
 
     parameters = {"lobes": n_lobes, "rounds": rounds, "storage": storage, "seed": seed}
-    maps, meta = lafortune.fit_texels(
-        "lafortune_lut", btf, fit_block, parameters, progress, storage, filter_type
+    return lafortune.fit_texels(
+        Representation, "lafortune_lut", btf, fit_block, parameters, progress, storage, filter_type
     )
-    result = Representation(maps, meta)
-    meta["fit"]["epsilon"] = light_functions.fit_report(result, btf)
-    return result
 
 
 def view_factor(luminance: np.ndarray, parameters: np.ndarray, btf: SampledBTF) -> np.ndarray:

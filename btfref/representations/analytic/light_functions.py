@@ -10,16 +10,21 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from btfref import conventions
-from btfref.errors import InputError
 from btfref.numerics.sphere import interpolation
 from btfref.precision import real
 from btfref.representations.guide import feature_views, texel_groups
-from btfref.representations.lookup import StoredMaps, evaluate_points
+from btfref.representations.lookup import (
+    StoredMaps,
+    base_meta,
+    direction_arrays,
+    evaluate_points,
+    refuse_not_finite,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -28,8 +33,10 @@ if TYPE_CHECKING:
 
     from btfref.representations.protocol import Representation
     from btfref.sampling.sampled_btf import SampledBTF
-    from btfref.types import Progress
+    from btfref.types import Facts, Progress
 
+
+M = TypeVar("M", bound="AnalyticMaps")
 
 #: Texels fitted at a time: bounds the memory of luminance tables and of normal equations.
 BLOCK = 4096
@@ -146,8 +153,7 @@ def luminance_blocks(
         block = np.asarray(btf.values[:, :, first : first + step], np.float32).reshape(
             n_views, n_lights, -1, 3
         )
-        if not np.isfinite(block).all():
-            raise InputError("the BTF holds a value that is not finite", file=btf.path)
+        refuse_not_finite(block, btf)
         luminance = block @ conventions.LUMINANCE.astype(np.float32)
         energy = np.einsum("vln,vln->n", luminance, luminance, dtype=float)
         chroma = np.einsum("vlnc,vln->nc", block, luminance, dtype=float)
@@ -206,6 +212,47 @@ def memory_report(maps: dict[str, np.ndarray], texels: int, n_views: int | None 
     result = {"float_bytes": 4 * numbers, "half_bytes": 2 * numbers, "code_bytes": numbers}
     if n_views is not None:
         result["published_bytes"] = round(PUBLISHED_BYTES * texels * n_views)
+    return result
+
+
+def finished(
+    made: type[M],
+    method: str,
+    btf: SampledBTF,
+    maps: dict[str, np.ndarray],
+    parameters: Facts,
+    *,
+    filter_type: str,
+    constants: Facts | None = None,
+    facts: Facts,
+    by_view: bool,
+) -> M:
+    """A representation of fitted maps, with what the fit says of itself.
+
+    Parameters
+    ----------
+    made : type
+        Of the representation.
+    method : str
+    btf : SampledBTF
+        What was fitted.
+    maps : dict of str to ndarray
+        Stored ones, without the direction tables.
+    parameters : dict
+        Of the fit.
+    filter_type : {"bilinear", "nearest"}
+    constants : dict, optional
+        Beside the measured edges.
+    facts : dict
+        For ``meta["fit"]``, beside ``epsilon`` (:func:`fit_report`) and ``memory`` (:func:`memory_report`).
+    by_view : bool
+        Whether it is a reflectance field for each view; see :func:`memory_report`.
+    """
+    meta = base_meta(method, btf, parameters, filter_type=filter_type)
+    meta["constants"] = edge_constants(btf) | (constants or {})
+    result = made(maps | direction_arrays(btf.views, btf.lights), meta)
+    memory = memory_report(maps, int(np.prod(btf.texels)), len(btf.views) if by_view else None)
+    meta["fit"] = facts | {"epsilon": fit_report(result, btf), "memory": memory}
     return result
 
 

@@ -26,7 +26,7 @@ from btfref.representations.analytic.lobe_start import (
     lobe_starts,
     tilted_starts,
 )
-from btfref.representations.lookup import base_meta, direction_arrays, positive_integer, stored
+from btfref.representations.lookup import positive_integer, stored
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -260,16 +260,17 @@ def fit(
         failed += np.stack([texel + part.start, view], 1).tolist()
     shapes = {"lobes": (rows, columns, n_views, -1), "colour": (rows, columns, 4)}
     maps = {name: stored(name, array.reshape(shapes[name]), storage) for name, array in maps.items()}
-    parameters = {"lobes": n_lobes, "diffuse_quantile": diffuse_quantile, "storage": storage, "seed": seed}
-    meta = base_meta("rf_lobes", btf, parameters, filter_type=filter_type)
-    meta["constants"] = light_functions.edge_constants(btf) | {"n_lobes": n_lobes}
-    result = Representation(maps | direction_arrays(btf.views, btf.lights), meta)
-    meta["fit"] = merged(summaries) | {
-        "not_converged_at": failed[:1000],
-        "epsilon": light_functions.fit_report(result, btf),
-        "memory": light_functions.memory_report(maps, rows * columns, n_views),
-    }
-    return result
+    return light_functions.finished(
+        Representation,
+        "rf_lobes",
+        btf,
+        maps,
+        {"lobes": n_lobes, "diffuse_quantile": diffuse_quantile, "storage": storage, "seed": seed},
+        filter_type=filter_type,
+        constants={"n_lobes": n_lobes},
+        facts=merged(summaries) | {"not_converged_at": failed[:1000]},
+        by_view=True,
+    )
 
 
 def merged(summaries: list[Facts]) -> Facts:

@@ -17,7 +17,7 @@ import numpy as np
 
 from btfref.precision import real
 from btfref.representations.analytic import light_functions
-from btfref.representations.lookup import base_meta, direction_arrays, stored
+from btfref.representations.lookup import stored
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -142,9 +142,13 @@ def fit(
         "polynomial": stored("polynomial", polynomial.reshape(rows, columns, n_views, 6), storage),
         "chroma": stored("chroma", chroma.reshape(rows, columns, 3), storage),
     }
-    meta = base_meta("rf_poly", btf, {"storage": storage, "seed": seed}, filter_type=filter_type)
-    meta["constants"] = light_functions.edge_constants(btf)
-    result = Representation(maps | direction_arrays(btf.views, btf.lights), meta)
-    memory = light_functions.memory_report(maps, rows * columns, n_views)
-    meta["fit"] = conditioning | {"epsilon": light_functions.fit_report(result, btf), "memory": memory}
-    return result
+    return light_functions.finished(
+        Representation,
+        "rf_poly",
+        btf,
+        maps,
+        {"storage": storage, "seed": seed},
+        filter_type=filter_type,
+        facts=conditioning,
+        by_view=True,
+    )

@@ -19,7 +19,7 @@ from btfref.numerics.solvers.factoring import map_operators
 from btfref.numerics.sphere.halfway import half_difference
 from btfref.numerics.sphere.parabolic import bilinear_stencil
 from btfref.precision import precision, real
-from btfref.representations.guide import N_GROUPS, feature_views, group_means, texel_groups
+from btfref.representations.guide import feature_views, group_means, spread_members, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points
 
 if TYPE_CHECKING:
@@ -147,12 +147,7 @@ class Representation(StoredMaps):
             ]
         )
         labels = texel_groups(features)
-        order = np.argsort(labels, kind="stable")
-        rank = np.arange(n_texels) - np.searchsorted(labels[order], labels[order])
-        count = np.bincount(labels, minlength=N_GROUPS)[labels[order]]
-        # Evenly spread members, so that a large group is not judged by its first rows.
-        spacing = np.maximum(count // GUIDE_MEMBERS, 1)
-        members = order[(rank % spacing == 0) & (rank // spacing < GUIDE_MEMBERS)]
+        members = spread_members(labels, GUIDE_MEMBERS)
         operators = map_operators(views, lights, self.maps["factor_p"].shape[1], "d" in self.names)
         tables = np.concatenate(
             [

@@ -10,7 +10,7 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.representations.factored.definition import texel_parts
-from btfref.representations.lookup import positive_integer
+from btfref.representations.lookup import positive_integer, refuse_not_finite
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -148,8 +148,7 @@ def unit_tables(btf: SampledBTF, texels: np.ndarray) -> tuple[np.ndarray, np.nda
     tables = (
         btf.values.reshape(views, lights, -1, 3)[:, :, texels].astype(np.float32).reshape(views, lights, -1)
     )
-    if not np.isfinite(tables).all():
-        raise InputError("a value is not finite", file=btf.path, field="values")
+    refuse_not_finite(tables, btf)
     tables = np.maximum(tables, 0)
     mean = tables.mean((0, 1))
     return tables / np.where(mean > 0, mean, 1), mean

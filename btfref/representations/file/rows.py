@@ -36,7 +36,7 @@ _MULTI_PART = 0x1000
 
 
 @dataclass(frozen=True)
-class _Part:
+class _PartHeader:
     """What the header of a part says: channels in the order of the file, and where its chunks begin."""
 
     channels: list[str]
@@ -172,7 +172,7 @@ class RowReader:
                 raise self._damaged("a name without end")
         return letters.decode("utf-8", "replace")
 
-    def _headers(self) -> dict[str, _Part]:
+    def _headers(self) -> dict[str, _PartHeader]:
         """Parts by name, those that can be read here."""
         _, version = struct.unpack("<ii", self._take(8))
         headers = []
@@ -207,7 +207,9 @@ class RowReader:
             if simple and compression in LINES:
                 name = header.get("name", b"").rstrip(b"\0").decode("utf-8", "replace")
                 names = [channel for channel, _ in channels]
-                parts[name] = _Part(names, TYPES[kinds.pop()], compression, rows, columns, chunks, offset)
+                parts[name] = _PartHeader(
+                    names, TYPES[kinds.pop()], compression, rows, columns, chunks, offset
+                )
             offset += 8 * chunks
         return parts
 

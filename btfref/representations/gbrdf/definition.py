@@ -25,7 +25,7 @@ from btfref.numerics.sphere.halfway import half_vector
 from btfref.numerics.sphere.parabolic import bilinear_stencil
 from btfref.precision import computing_in, real
 from btfref.representations.file.resident import refuse_absent
-from btfref.representations.guide import group_means, texel_groups
+from btfref.representations.guide import group_means, spread_members, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points
 from btfref.representations.protocol import Entries
 
@@ -236,11 +236,7 @@ class Representation(StoredMaps):
             for first in range(0, rows * columns, _BLOCK)
         ]
         labels = texel_groups(np.concatenate(features)[:, 0])
-        order = np.argsort(labels, kind="stable")
-        rank = np.arange(len(labels)) - np.searchsorted(labels[order], labels[order])
-        count = np.bincount(labels)[labels[order]]
-        spacing = np.maximum(count // GUIDE_MEMBERS, 1)
-        members = order[(rank % spacing == 0) & (rank // spacing < GUIDE_MEMBERS)]
+        members = spread_members(labels, GUIDE_MEMBERS)
         means = group_means(labels[members], self._luminance(members, lights, views).astype(np.float32))
         return labels.reshape(rows, columns), means
 

@@ -13,7 +13,7 @@ from btfref.numerics.solvers.lowrank import range_basis, texel_matrix
 from btfref.numerics.ycbcr import CHANNELS, FROM_RGB, RGB_METRIC, RGB_WEIGHT
 from btfref.representations.analytic.light_functions import edge_constants
 from btfref.representations.laplacian.levels import Representation
-from btfref.representations.lookup import base_meta, direction_arrays, stored
+from btfref.representations.lookup import base_meta, direction_arrays, refuse_not_finite, stored, unit_peaks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,7 +33,7 @@ LARGEST = 64
 PHONG_LIMIT = 0.02
 
 #: Weights and basis of one channel of a level as they are stored.
-Stored = tuple[np.ndarray, np.ndarray]
+StoredChannel = tuple[np.ndarray, np.ndarray]
 
 _CHOICES = {
     "mean": ("auto", "phong", "stored"),
@@ -217,8 +217,7 @@ def _pyramids(btf: SampledBTF, n_levels: int, reduction: str) -> list[list[np.nd
     """Gaussian pyramids [channel][level] of shape (rows, columns, pairs), float32."""
     rows, columns = btf.values.shape[2:4]
     matrix = texel_matrix(btf.values)
-    if not np.isfinite(matrix).all():
-        raise InputError("the BTF holds a value that is not finite", file=btf.path)
+    refuse_not_finite(matrix, btf)
     matrix = matrix.reshape(rows, columns, -1, 3)
     return [gaussian_pyramid(matrix @ row.astype(np.float32), n_levels, reduction) for row in FROM_RGB]
 
@@ -278,7 +277,7 @@ class _Levels:
         self.level_errors: dict[int, float] = {}
         self.gram = np.zeros((3, 3))
         #: [channel]: coarser levels as they are stored, and as they were.
-        self.kept: list[list[Stored]] = [[] for _ in CHANNELS]
+        self.kept: list[list[StoredChannel]] = [[] for _ in CHANNELS]
         self.exact: list[list[np.ndarray]] = [[] for _ in CHANNELS]
 
     def _predicted(self, channel: int, shape: tuple[int, ...], *, exact: bool) -> np.ndarray:
@@ -327,14 +326,15 @@ class _Levels:
             return np.zeros((0, rest.shape[1]), np.float32), np.zeros((len(rest), 0), np.float32)
         return range_basis(rest, rank, self.rng, iterations=2)
 
-    def _stored(self, k: int, basis: np.ndarray, coordinate: np.ndarray, n: int) -> Stored:
+    def _stored(self, k: int, basis: np.ndarray, coordinate: np.ndarray, n: int) -> StoredChannel:
         """Weights and basis of the first components as they are stored."""
-        # Axes have unit peak: half floats spend their range on the shape, weights on the amount.
-        peak = np.maximum(np.abs(basis[:n]).max(1, initial=0), np.finfo(np.float32).tiny)
+        shapes, peak = unit_peaks(basis[:n])
         weights = stored(f"weights_{k}", coordinate[:, :n] * peak, self.storage)
-        return weights, stored(f"basis_{k}", basis[:n] / peak[:, None], self.storage)
+        return weights, stored(f"basis_{k}", shapes, self.storage)
 
-    def _keep(self, k: int, shape: tuple[int, ...], rests: list[np.ndarray], parts: list[Stored]) -> None:
+    def _keep(
+        self, k: int, shape: tuple[int, ...], rests: list[np.ndarray], parts: list[StoredChannel]
+    ) -> None:
         for channel, (weights, basis) in enumerate(parts):
             if len(basis):
                 wide = weights.astype(np.float32).reshape(*shape, -1), basis.astype(np.float32)
@@ -356,7 +356,7 @@ class _Levels:
         }
 
 
-def _product(part: Stored) -> np.ndarray:
+def _product(part: StoredChannel) -> np.ndarray:
     weights, basis = (a.astype(np.float32) for a in part)
     return weights @ basis
 

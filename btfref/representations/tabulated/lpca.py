@@ -27,6 +27,7 @@ from btfref.representations.lookup import (
     packed_arrays,
     positive_integer,
     stored,
+    unit_peaks,
 )
 from btfref.representations.protocol import Entries
 
@@ -189,10 +190,9 @@ def fit(
     means, axes, weights, error = _cluster_bases(
         matrix, squares, subspace, coordinates, labels, clusters, components
     )
-    # Axes are stored with unit peak: half floats then spend their range on the shape, weights on the amount.
-    peak = np.maximum(np.abs(axes).max(-1), np.finfo(np.float32).tiny)
+    axes, peak = unit_peaks(axes)
     weights = weights * peak[labels]
-    table = np.concatenate([means[:, None], axes / peak[..., None]], 1)
+    table = np.concatenate([means[:, None], axes], 1)
     table = table.reshape(clusters, 1 + components, len(btf.views), len(btf.lights), 3)
     maps = {
         "basis": stored("basis", table, storage),

@@ -17,6 +17,7 @@ from btfref.representations.lookup import (
     direction_arrays,
     evaluate_tabulated,
     meta_for,
+    refuse_not_finite,
 )
 
 if TYPE_CHECKING:
@@ -91,8 +92,7 @@ def fit(
         For values that are not finite.
     """
     for view in btf.values:
-        if not np.isfinite(view).all():
-            raise InputError("the BTF holds a value that is not finite", file=btf.path)
+        refuse_not_finite(view, btf)
     values = np.ascontiguousarray(np.transpose(btf.values, (2, 3, 0, 1, 4)))
     meta = base_meta("raw", btf, {}, filter_type=filter_type)
     return Representation({"values": values, **direction_arrays(btf.views, btf.lights)}, meta)

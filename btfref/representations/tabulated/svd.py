@@ -22,6 +22,7 @@ from btfref.representations.lookup import (
     packed_arrays,
     positive_integer,
     stored,
+    unit_peaks,
 )
 
 if TYPE_CHECKING:
@@ -118,8 +119,8 @@ def fit(
     basis, weights = range_basis(matrix, components, np.random.default_rng(seed), iterations=2)
     energy = float(np.einsum("ij,ij->", matrix, matrix, dtype=np.float64))
     kept = float((weights.astype(float) ** 2).sum())
-    peak = np.maximum(np.abs(basis).max(1), np.finfo(np.float32).tiny)
-    table = (basis / peak[:, None]).reshape(-1, len(btf.views), len(btf.lights), 3)
+    shapes, peak = unit_peaks(basis)
+    table = shapes.reshape(-1, len(btf.views), len(btf.lights), 3)
     maps = {
         "basis": stored("basis", table, storage),
         "weights": stored("weights", (weights * peak).reshape(rows, columns, -1), storage),

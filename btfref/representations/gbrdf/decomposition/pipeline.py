@@ -19,7 +19,7 @@ from btfref.representations.gbrdf.decomposition.reflectance import (
     material_reflectance,
     texel_reflectance,
 )
-from btfref.representations.lookup import positive_integer
+from btfref.representations.lookup import positive_integer, refuse_not_finite
 
 if TYPE_CHECKING:
     from btfref.representations.gbrdf.definition import Representation
@@ -130,7 +130,8 @@ def fit(
     if similarity not in SIMILARITIES:
         expected = " or ".join(SIMILARITIES)
         raise InputError("a parameter is out of range", field="similarity", got=similarity, expected=expected)
-    _refuse_not_finite(btf)
+    for view in btf.values:
+        refuse_not_finite(view, btf)
     report = progress or (lambda *_: None)
     shape = btf.values.shape[2:4]
     reciprocal = ReciprocalPairs(btf, pairs, seed)
@@ -214,9 +215,3 @@ def save_stages(stages: dict[str, np.ndarray], path: PathLike) -> None:
     """
     with new_file(path) as draft, draft.open("wb") as stream:
         np.savez(stream, allow_pickle=True, **stages)
-
-
-def _refuse_not_finite(btf: SampledBTF) -> None:
-    for view in range(len(btf.views)):
-        if not np.isfinite(btf.values[view]).all():
-            raise InputError("the BTF holds a value that is not finite", file=btf.path)

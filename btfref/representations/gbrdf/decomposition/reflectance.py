@@ -45,7 +45,7 @@ TEXEL_NDF = 16
 
 
 @dataclass(frozen=True)
-class Samples:
+class BlockSamples:
     """What the surface points of a block of N texels show; P pairs (view, light), view slowest.
 
     Everything is multiplied by the weight: 1 / L where seen, lit and not grazing, else 0.
@@ -76,7 +76,7 @@ class Samples:
 
 
 class SurfaceSamples:
-    """Samples of a BTF on a height field.
+    """BlockSamples of a BTF on a height field.
 
     Parameters
     ----------
@@ -112,8 +112,10 @@ class SurfaceSamples:
         """Texels of each block, as slices of the flat index."""
         return [slice(i, min(i + BLOCK, self.n_texels)) for i in range(0, self.n_texels, BLOCK)]
 
-    def read(self, part: slice, size: int, group: np.ndarray | None = None, colour: bool = True) -> Samples:
-        """Samples of some texels.
+    def read(
+        self, part: slice, size: int, group: np.ndarray | None = None, colour: bool = True
+    ) -> BlockSamples:
+        """BlockSamples of some texels.
 
         Parameters
         ----------
@@ -128,7 +130,7 @@ class SurfaceSamples:
 
         Returns
         -------
-        Samples
+        BlockSamples
         """
         views, lights = self._directions
         frame = self._frame[part]
@@ -157,7 +159,7 @@ class SurfaceSamples:
         group = np.arange(n) if group is None else group
         factor = geometry_factor(cos_light[None], cos_view[:, None]).astype(np.float32).reshape(-1, n)
         light = np.broadcast_to(cos_light[None], (n_views, n_lights, n)).reshape(-1, n)
-        return Samples(
+        return BlockSamples(
             (values if colour else luminance[None]) * weight,
             light * weight * np.float32(1 / np.pi),
             factor * weight,
@@ -172,14 +174,14 @@ def mean_luminance(btf: SampledBTF) -> float:
     return float((some @ LUMINANCE.astype(np.float32)).mean()) + 1e-9
 
 
-def diffuse_colour(channel: np.ndarray, samples: Samples, gloss: np.ndarray) -> np.ndarray:
+def diffuse_colour(channel: np.ndarray, samples: BlockSamples, gloss: np.ndarray) -> np.ndarray:
     """c_d by eq. 9 to 11, shape (N,) in [0, 1].
 
     Parameters
     ----------
     channel : ndarray, shape (P, N)
         One channel of ``samples.values``.
-    samples : Samples
+    samples : BlockSamples
     gloss : ndarray, shape (P, N)
         Weighted c_s p F k1·n / D.
     """
@@ -187,7 +189,7 @@ def diffuse_colour(channel: np.ndarray, samples: Samples, gloss: np.ndarray) -> 
 
 
 def distribution(
-    rest: np.ndarray, amount: np.ndarray, samples: Samples, size: int
+    rest: np.ndarray, amount: np.ndarray, samples: BlockSamples, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sums over the samples of each texel of the distributions, for p by eq. 12 to 14.
 
@@ -197,7 +199,7 @@ def distribution(
         Weighted δ_p: what the diffuse part leaves.
     amount : ndarray, shape (P, N)
         Weighted λ_p = c_s F k1·n / D.
-    samples : Samples
+    samples : BlockSamples
     size : int
         Texels of all tables.
 
@@ -215,7 +217,7 @@ def specular_amount(rest: np.ndarray, shape: np.ndarray) -> np.ndarray:
     return _projection(rest, shape)
 
 
-def normal_reflectance(rest: np.ndarray, shape: np.ndarray, samples: Samples) -> np.ndarray:
+def normal_reflectance(rest: np.ndarray, shape: np.ndarray, samples: BlockSamples) -> np.ndarray:
     """r0 by eq. 18 to 20, shape (N,) in [0, 1]; ``shape`` is the weighted c_s p k1·n / D."""
     return np.clip(_projection(rest - shape * samples.fifth, shape * (1 - samples.fifth)), 0, 1)
 
