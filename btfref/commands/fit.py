@@ -8,7 +8,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 
 from btfref.commands.shared.options import add_json, add_seed
-from btfref.commands.shared.printing import Progress, bytes_text, emit, emit_json
+from btfref.commands.shared.printing import Progress, write_representation
 from btfref.commands.shared.reading import assignments, output_file
 from btfref.errors import InputError
 
@@ -60,7 +60,6 @@ def run(args: Namespace) -> int:
         given["target_error"] = args.target_error
     parameters = row.settings(args.preset, given)
 
-    from btfref.representations.file.container import read_info, save
     from btfref.representations.protocol import FitsPartially
     from btfref.sampling import SampledBTF, open_store
 
@@ -73,10 +72,5 @@ def run(args: Namespace) -> int:
         btf = SampledBTF.load(args.btf)
         with Progress() as progress:
             representation = row.fit(btf, seed=args.seed, progress=progress, **parameters)
-    save(representation, out)
-    info = read_info(out)
-    if args.json:
-        emit_json(info)
-    else:
-        emit(f"{out}: {info['method']}, maps {bytes_text(info['payload_bytes'])}, 1:{info['ratio']:.3g}")
+    write_representation(representation, out, json=args.json)
     return 0

@@ -11,7 +11,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from btfref.commands.shared.options import add_dtype, add_json
-from btfref.commands.shared.printing import Progress, bytes_text, emit, emit_json
+from btfref.commands.shared.printing import Progress, bytes_text, emit, emit_json, write_representation
 from btfref.commands.shared.reading import count, direction_set, number_above, output_file
 
 
@@ -91,8 +91,6 @@ def run(args: Namespace) -> int:
 
 def _representation(args: Namespace, out: Path) -> int:
     """A representation from pictures."""
-    from btfref.representations.file.container import read_info, save
-
     if args.format == "maps":
         from btfref.formats.maps import import_maps
 
@@ -101,10 +99,5 @@ def _representation(args: Namespace, out: Path) -> int:
         from btfref.representations.gbrdf.build import from_photograph
 
         representation = from_photograph(args.path)
-    save(representation, out)
-    info = read_info(out)
-    if args.json:
-        emit_json(info)
-    else:
-        emit(f"{out}: {info['method']}, maps {bytes_text(info['payload_bytes'])}")
+    write_representation(representation, out, json=args.json)
     return 0

@@ -97,23 +97,13 @@ def lines(result: Validation) -> Iterator[str]:
 
 
 def _self_test(args: Namespace) -> int:
-    from btfref.gates.verdicts import with_class
-    from btfref.validate.self_test import self_test
+    from btfref.validate.self_test import Caught, self_test
 
     with Progress() as progress:
         caught = self_test(progress=progress)
     if args.json:
         emit_json({"kind": "self-test", "schema": 1, "faults": [fault.to_dict() for fault in caught]})
     else:
-        rows = [
-            [
-                f.name,
-                with_class(f.meant),
-                "caught" if f.caught else "MISSED",
-                ", ".join(map(with_class, f.failed)) or "none",
-            ]
-            for f in caught
-        ]
-        for line in table(rows, header=["fault", "meant for", "by it", "gates that failed"]):
+        for line in table([fault.row for fault in caught], header=Caught.HEAD):
             emit(line)
     return 0 if all(fault.caught for fault in caught) else 1

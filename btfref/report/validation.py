@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from btfref.gates.verdicts import GateResult, with_class
+from btfref.gates.verdicts import GateResult
 from btfref.report.cell import Cell, asset, script_json
 from btfref.report.figures import thumbnail
 from btfref.report.pack import pack, pack_text
@@ -356,13 +356,4 @@ def _methods(result: Validation) -> str:
 
 
 def _self_test(caught: Sequence[Caught]) -> str:
-    body = [
-        [
-            f.name,
-            with_class(f.meant),
-            "caught" if f.caught else "missed",
-            ", ".join(map(with_class, f.failed)) or "none",
-        ]
-        for f in caught
-    ]
-    return _table(["fault", "meant for", "by it", "gates that failed"], body)
+    return _table(caught[0].HEAD, [fault.row for fault in caught])

@@ -10,9 +10,11 @@ import tempfile
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 from btfref.errors import BtfrefError
 from btfref.gates.tolerances import gate_table, limits
+from btfref.gates.verdicts import with_class
 from btfref.platform import shader_directory
 from btfref.validate.fault_bench import Bench
 from btfref.validate.faults import FAULTS
@@ -36,8 +38,17 @@ class Caught:
     name: str
     meant: str
     caught: bool
-    failed: tuple
-    clean: tuple
+    failed: tuple[str, ...]
+    clean: tuple[str, ...]
+
+    #: Head of a table of faults.
+    HEAD: ClassVar = ("fault", "meant for", "by it", "gates that failed")
+
+    @property
+    def row(self) -> list[str]:
+        """Cells of a table with the head `HEAD`; limits with the class of pixels that they judge."""
+        failed = ", ".join(map(with_class, self.failed)) or "none"
+        return [self.name, with_class(self.meant), "caught" if self.caught else "MISSED", failed]
 
     def to_dict(self):
         """JSON-able form."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from btfref.gates import GateResult
+    from btfref.representations.protocol import Representation
 
 
 def emit(text: str = "", *, flush: bool = False) -> None:
@@ -98,6 +99,18 @@ def number(value: float | str | None) -> str:
     if isinstance(value, bool | str):
         return str(value)
     return f"{value:.4g}"
+
+
+def write_representation(representation: Representation, out: Path, *, json: bool) -> None:
+    """Write a representation's file and say what is in it, as one line or as JSON."""
+    from btfref.representations.file.container import read_info, save
+
+    save(representation, out)
+    info = read_info(out)
+    if json:
+        emit_json(info)
+    else:
+        emit(f"{out}: {info['method']}, maps {bytes_text(info['payload_bytes'])}, 1:{info['ratio']:.3g}")
 
 
 #: What :func:`gate_cells` gives, as the head of a table.

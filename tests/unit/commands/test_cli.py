@@ -350,6 +350,23 @@ def test_rows_of_gates_name_measure_class_and_limit():
     assert "image.noise_free interior largest relative error 0.0004 ≤ 0.01 pass" in shown
 
 
+def test_a_fault_names_the_class_of_pixels_that_its_gate_judges():
+    from btfref.validate.self_test import Caught
+
+    limits = ("image.noise_free.p999", "probe.agreement.max")
+    assert Caught("x", limits[0], True, limits, ()).row == [
+        *("x", "image.noise_free.p999 [interior]", "caught"),
+        "image.noise_free.p999 [interior], probe.agreement.max",
+    ]
+
+
+def test_the_margin_of_demand_is_in_degrees(monkeypatch, capsys):
+    found = {}
+    monkeypatch.setattr("btfref.scene.demand.demand", lambda scene, **given: found.update(given) or {})
+    assert main(["demand", "plane", "--views", "ubo81", "--margin", "90"]) == 2  # nothing was found
+    assert found["margin"] == np.pi / 2
+
+
 def test_info_of_images(tmp_path, capsys):
     from btfref.images import save_image
 
