@@ -86,6 +86,7 @@ CODE = {
         "btfref/images",
         "btfref/gates",
         "btfref/comparison",
+        "btfref/stress",
         "btfref/validate",
         "mitsuba_plugins",
         "shaders",

@@ -1,12 +1,75 @@
 """Mitsuba 3 plugin ``btf``: every compressed representation as a BSDF.
 
 After ``mi.set_variant(...)`` call :func:`register`; then scenes may use
-``{"type": "btf", "filename": "checker.lpca.exr"}``.
+``{"type": "btf", "filename": "checker.lpca.exr"}``. :func:`ready` does both for who does not mind the variant, and
+:func:`load` loads one material.
 """
 
 from __future__ import annotations
 
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from btfref.types import JitArray, PathLike
+
 _registered: set[str] = set()
+
+
+def ready(prefer: str = "llvm_ad_rgb") -> ModuleType:
+    """Mitsuba in a variant that takes the plugin, with the plugin registered.
+
+    Parameters
+    ----------
+    prefer : str
+        Variant to set where none is set, or one that cannot take the plugin; another stays.
+
+    Returns
+    -------
+    module
+        ``mitsuba``.
+
+    Raises
+    ------
+    MissingDependencyError
+        Without a usable LLVM.
+    InputError
+        As :func:`register`.
+    """
+    from btfref.platform import prepare_llvm
+
+    prepare_llvm()
+    import mitsuba as mi
+
+    if not _takes_the_plugin(mi.variant()):
+        mi.set_variant(prefer)
+    register()
+    return mi
+
+
+def load(path: PathLike, **parameters: object) -> JitArray:
+    """The BSDF of a representation's file.
+
+    Parameters
+    ----------
+    path : path-like
+    **parameters
+        Of the plugin, such as ``filter_type="nearest"``.
+
+    Returns
+    -------
+    mitsuba.BSDF
+
+    Raises
+    ------
+    RuntimeError
+        From Mitsuba, with the reason of the plugin: a file or a parameter that it does not take.
+    """
+    return ready().load_dict({"type": "btf", "filename": str(path), **parameters})
+
+
+def _takes_the_plugin(variant: str | None) -> bool:
+    return variant is not None and variant.endswith("_rgb") and not variant.startswith("scalar")
 
 
 def register() -> None:
@@ -22,7 +85,7 @@ def register() -> None:
     from btfref.errors import InputError
 
     variant = mi.variant()
-    if variant is None or not variant.endswith("_rgb") or variant.startswith("scalar"):
+    if not _takes_the_plugin(variant):
         raise InputError(
             "the plugin 'btf' needs a JIT-compiled, unpolarized RGB variant of Mitsuba",
             got=variant,

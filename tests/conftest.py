@@ -134,6 +134,30 @@ def renderers(need):
     need("gl")
 
 
+@pytest.fixture
+def load_plugin(llvm):
+    """``load_plugin(path, **parameters)``: the plugin of a representation's file, in ``llvm_ad_rgb``."""
+    import mitsuba_plugins
+
+    return mitsuba_plugins.load
+
+
+@pytest.fixture
+def evaluator(need):
+    """``evaluator(name, representation, path)`` of `btfref.stress.evaluators`, where this machine has what it needs."""
+    from btfref.stress import evaluators
+
+    def make(name, representation, path=None, **parameters):
+        row = evaluators.EVALUATORS[name]
+        if row.needs:
+            need(row.needs)
+        return evaluators.evaluator(name, representation, path, **parameters)
+
+    yield make
+    if "drjit" in sys.modules:
+        _free()
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _free_jit_state():
     """No array of one test module keeps memory, or leaves pending work, for the next."""

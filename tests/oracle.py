@@ -4,31 +4,25 @@ from __future__ import annotations
 
 import fcntl
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from btfref.numerics.sphere.directions import directions
 from btfref.registry import method
 from btfref.representations import save
-from btfref.sampling import SampledBTF
-from btfref.stress.data import bumpy_values
+from btfref.stress.data import bumpy
+from btfref.stress.lookups import hemisphere
 
 
 def oracle_btf(shape=(16, 12), views="ubo81", lights="ubo81", dtype="float16", seed=0):
-    """The values of :func:`btfref.stress.data.bumpy_values` as a :class:`SampledBTF`."""
-    views, lights = directions(views), directions(lights)
-    values = bumpy_values(shape, views, lights, seed).astype(dtype)
-    return SampledBTF(
-        values=values, views=views, lights=lights, variance=None, attributes={"mesostructure": "oracle"}
-    )
+    """The bumpy BTF of the stress suite, named so that a file says where it is from."""
+    return replace(bumpy(seed, shape, views, lights, dtype), attributes={"mesostructure": "oracle"})
 
 
 def scattered(n=81, seed=3):
     """Directions without rings: `n` unit vectors of the upper hemisphere, shape (n, 3)."""
-    w = np.random.default_rng(seed).normal(size=(n, 3))
-    w[:, 2] = np.abs(w[:, 2])
-    return w / np.linalg.norm(w, axis=1, keepdims=True)
+    return hemisphere(np.random.default_rng(seed), n, float)
 
 
 #: Sets of (views, lights): rings, rings with shifted azimuths, sets without a pole or rings of their own, no rings.

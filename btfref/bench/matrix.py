@@ -41,18 +41,14 @@ def run(plan, out, *, btf=None, progress=None):
     str
         Number of the run.
     """
-    from btfref.platform import prepare_llvm
-
     writer = _Writer(Path(out), plan)
     if {"eval", "render", "sampling"} & set(plan.measures):
-        prepare_llvm()
-        import mitsuba as mi
-
-        if mi.variant() is None or not mi.variant().endswith("_ad_rgb"):
-            mi.set_variant("cuda_ad_rgb" if _has_cuda() else "llvm_ad_rgb")
         import mitsuba_plugins
+        from btfref.platform import prepare_llvm
 
-        mitsuba_plugins.register()
+        # Before Dr.Jit is asked what it has.
+        prepare_llvm()
+        mi = mitsuba_plugins.ready("cuda_ad_rgb" if _has_cuda() else "llvm_ad_rgb")
         writer.run["variant"] = mi.variant()
     writer.header()
     data = dict(plan.data)

@@ -10,13 +10,22 @@ from __future__ import annotations
 import gc
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from btfref.bench import scenes
-from btfref.bench.evaluators import EVALUATORS, evaluation, random_points
 from btfref.bench.timing import interleaved, kernels, peak_memory, reset_peak
+from btfref.stress.evaluators import DEFINITION, EVALUATORS, evaluator
+from btfref.stress.lookups import hemisphere
+
+if TYPE_CHECKING:
+    from btfref.bench.plan import Entry, Plan
+    from btfref.bench.subjects import Built
+    from btfref.representations.protocol import Representation
+    from btfref.types import Facts, PathLike
 
 
 def timed_builds(makes, rounds, report=lambda name: None):
@@ -83,44 +92,63 @@ def sample_queries(btf, n, rng):
     }
 
 
-def measure_eval(built, path, plan, entry, rng):
-    """Evaluations by NumPy, Dr.Jit and GLSL, each on its own number of points.
+def measure_eval(
+    built: Built, path: PathLike | None, plan: Plan, entry: Entry, rng: np.random.Generator
+) -> Iterator[Facts]:
+    """Evaluations by all evaluators that the plan has points for, each on its own number of them.
 
     Yields
     ------
     dict
         ``largest_difference`` from NumPy's values at the first points, over the largest of these.
     """
-    known = EVALUATORS if built.representation is not None else EVALUATORS[:1]
-    points = {kind: random_points(plan.settings["points"][kind], rng) for kind in known}
+    # What is no method of ours has no port.
+    known = [name for name in EVALUATORS if name in plan.settings["points"]]
+    known = known if built.representation is not None else [DEFINITION]
+    points = {name: random_points(plan.settings["points"][name], rng) for name in known}
     for query in entry.query:
         reference = None
-        for kind in known:
-            with evaluation(kind, built, path, points[kind], query) as (run, values):
-                cold, facts = _cold(run, kind == "drjit")
-                times = interleaved({kind: run}, plan.rounds["eval"])[kind]
-                found = values()
+        for name in known:
+            # A peer is asked for values alone.
+            subject = evaluator(name, built.representation or cast("Representation", built), path, **query)
+            with subject.prepare(*points[name]) as evaluation:
+                cold, facts = _cold(evaluation.run, EVALUATORS[name].compiles)
+                times = interleaved({name: evaluation.run}, plan.rounds["eval"])[name]
+                found = evaluation.values()
                 if facts:
-                    facts["kernels"]["warm_execution_s"] = kernels(run)["execution_s"]
+                    facts["kernels"]["warm_execution_s"] = kernels(evaluation.run)["execution_s"]
             if reference is None:
-                reference = found
-                some = points[kind]
+                reference, some = found, points[name]
             else:
                 # The same points again, by this evaluator.
-                with evaluation(kind, built, path, some, query) as (run, values):
-                    run()
-                    found = values()
+                found = subject.evaluate(*some)
             largest = float(np.abs(reference).max())
             difference = float(np.abs(found - reference).max()) / largest if largest else 0.0
             yield {
                 "query": query,
-                "evaluator": kind,
-                "points": len(points[kind][0]),
+                "evaluator": name,
+                "points": len(points[name][0]),
                 "cold_s": cold,
                 "warm_s": times,
                 **facts,
                 "largest_difference": difference,
             }
+
+
+def random_points(n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Texture coordinates and directions, uniform over the tile and over the hemispheres.
+
+    Parameters
+    ----------
+    n : int
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    uv : ndarray of float32, shape (n, 2)
+    w_light, w_view : ndarray of float32, shape (n, 3)
+    """
+    return rng.random((n, 2), np.float32), hemisphere(rng, n), hemisphere(rng, n)
 
 
 def measure_render(subjects, btf, plan):

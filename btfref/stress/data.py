@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
 
 from btfref.errors import InputError
-from btfref.numerics.sphere.directions import directions, spherical
+from btfref.numerics.sphere.directions import DirectionSet, directions, spherical
 from btfref.sampling import SampledBTF
+
+if TYPE_CHECKING:
+    #: Changes the values of a BTF: ``(values, rng) -> values``.
+    Change = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 
 #: Rows and columns where the data do not ask for others.
 SHAPE = (16, 12)
 
 
-def bumpy_values(shape, views, lights, seed=0):
+def bumpy_values(
+    shape: tuple[int, int], views: DirectionSet, lights: DirectionSet, seed: int = 0
+) -> np.ndarray:
     """A checker of a rough and a glossy material on bumps, without noise.
 
     Parameters
@@ -48,19 +58,43 @@ def bumpy_values(shape, views, lights, seed=0):
     return ((shade + gloss[..., None]) * visible[:, None, ..., None]).astype(np.float32)
 
 
-def _bumpy(seed, shape=SHAPE, views="ubo81", lights="ubo81", dtype="float16", change=None):
-    """The bumpy BTF after ``change(values, rng)``."""
-    views, lights = directions(views), directions(lights)
-    values = bumpy_values(shape, views, lights, seed)
+def bumpy(
+    seed: int = 0,
+    shape: tuple[int, int] = SHAPE,
+    views: str | ArrayLike = "ubo81",
+    lights: str | ArrayLike = "ubo81",
+    dtype: DTypeLike = "float16",
+    change: Change | None = None,
+) -> SampledBTF:
+    """The values of :func:`bumpy_values` as a BTF, after ``change(values, rng)``.
+
+    Parameters
+    ----------
+    seed : int
+    shape : (int, int)
+        Rows and columns.
+    views, lights : str or array_like
+        As of :func:`btfref.numerics.sphere.directions.directions`.
+    dtype : numpy.dtype
+    change : callable, optional
+
+    Returns
+    -------
+    SampledBTF
+    """
+    sets = directions(views), directions(lights)
+    values = bumpy_values(shape, *sets, seed)
     if change is not None:
         values = change(values, np.random.default_rng([seed, 1]))
-    return SampledBTF(values.astype(dtype), views, lights, attributes={"mesostructure": "formula"})
+    return SampledBTF(values.astype(dtype), *sets, attributes={"mesostructure": "formula"})
 
 
-def _like(function):
+def _like(
+    function: Callable[[tuple[int, ...], np.random.Generator, DirectionSet], np.ndarray],
+) -> Callable[[int], SampledBTF]:
     """Data of the bumpy BTF's shape from ``function(shape, rng, lights)``, float32."""
 
-    def make(seed):
+    def make(seed: int) -> SampledBTF:
         views = lights = directions("ubo81")
         shape = (len(views), len(lights), *SHAPE, 3)
         values = function(shape, np.random.default_rng(seed), lights).astype(np.float32)
@@ -69,29 +103,29 @@ def _like(function):
     return make
 
 
-def _changed(change, **settings):
-    return lambda seed: _bumpy(seed, change=change, **settings)
+def _changed(change: Change, dtype: DTypeLike = "float16") -> Callable[[int], SampledBTF]:
+    return lambda seed: bumpy(seed, dtype=dtype, change=change)
 
 
-def _salt(values, rng):
+def _salt(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """One sample in a hundred is a thousand times the largest: fireflies."""
     hit = rng.random(values.shape[:-1]) < 0.01
     return np.where(hit[..., None], 1e3 * values.max(), values)
 
 
-def _noise(values, rng):
+def _noise(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Zero-mean noise of a measurement: a third of the values is negative."""
     return values + 0.5 * values.std() * rng.standard_normal(values.shape)
 
 
-def _duplicates(values, rng):
+def _duplicates(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Three different texels, each many times."""
     flat = values.reshape(*values.shape[:2], -1, 3)
     chosen = rng.integers(0, 3, flat.shape[2]) * (flat.shape[2] // 3)
     return flat[:, :, chosen].reshape(values.shape)
 
 
-def _relief(seed):
+def _relief(seed: int) -> SampledBTF:
     """Data that a height field explains: a g-BRDF of smooth bumps 0.1 deep, in two materials, at all its samples."""
     from btfref.numerics.microfacets import isotropic_ndf
     from btfref.representations.gbrdf.build import from_maps
@@ -114,24 +148,24 @@ def _relief(seed):
     return SampledBTF(values, chosen, chosen, attributes={"mesostructure": "formula"})
 
 
-def scattered(seed, n=40):
+def scattered(seed: int, n: int = 40) -> np.ndarray:
     """``n`` random unit vectors of the upper hemisphere: no rings, no symmetry, shape (n, 3)."""
     rng = np.random.default_rng([seed, 2])
     return spherical(np.arccos(rng.uniform(0.02, 1, n)), rng.uniform(0, 2 * np.pi, n))
 
 
 #: Data by name: what it is, and how it is made from a seed.
-DATA = {
-    "bumpy": ("smooth bumps of two materials, no noise", _bumpy),
+DATA: dict[str, tuple[str, Callable[[int], SampledBTF]]] = {
+    "bumpy": ("smooth bumps of two materials, no noise", bumpy),
     "scattered": (
         "the same at random directions, 7 x 5 texels",
-        lambda seed: _bumpy(seed, (7, 5), scattered(seed), scattered(seed + 1)),
+        lambda seed: bumpy(seed, (7, 5), scattered(seed), scattered(seed + 1)),
     ),
-    "line": ("the same on 1 x 13 texels", lambda seed: _bumpy(seed, (1, 13))),
-    "one texel": ("the same on one texel", lambda seed: _bumpy(seed, (1, 1))),
+    "line": ("the same on 1 x 13 texels", lambda seed: bumpy(seed, (1, 13))),
+    "one texel": ("the same on one texel", lambda seed: bumpy(seed, (1, 1))),
     "one direction": (
         "one view and one light, both the pole",
-        lambda seed: _bumpy(seed, views=[[0, 0, 1]], lights=[[0, 0, 1]]),
+        lambda seed: bumpy(seed, views=[[0, 0, 1]], lights=[[0, 0, 1]]),
     ),
     "constant": ("0.25 for every pair", _like(lambda shape, rng, lights: np.full(shape, 0.25))),
     "black": ("0 for every pair", _like(lambda shape, rng, lights: np.zeros(shape))),
@@ -158,7 +192,7 @@ DATA = {
 }
 
 
-def make(name, seed=0):
+def make(name: str, seed: int = 0) -> SampledBTF:
     """The data ``name``.
 
     Returns

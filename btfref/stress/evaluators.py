@@ -1,139 +1,355 @@
-"""The evaluators of a representation under one interface: lookups in, values of B out."""
+"""The evaluators of a representation: one table that stress, validation, benchmarks and the tests share.
+
+A new evaluator is a class below and a row of :data:`EVALUATORS`; nothing else lists them. Who wants only some of them
+chooses by what the rows say.
+"""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import partial
+from types import ModuleType
+from typing import TYPE_CHECKING, Protocol
+
 import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
 
 from btfref import conventions
 from btfref.errors import InputError
+from btfref.precision import computing_in
 
-#: Ports by name. The definition, in float64, is what they are measured against.
-PORTS = ("numpy float32", "drjit", "drjit without FastMath", "glsl")
-
-
-def definition(representation, lookups):
-    """Values in float64; a representation with levels gets each lookup's own, shape (n, 3)."""
-    return representation.evaluate(*lookups.points, lod=lookups.lod)
+if TYPE_CHECKING:
+    from btfref.representations.protocol import Representation
+    from btfref.types import JitArray, PathLike
 
 
-def port(name, representation, path):
-    """An evaluator.
+class Evaluation(Protocol):
+    """Lookups that are set up once and evaluated as often as wanted: what a benchmark times."""
+
+    def run(self) -> None:
+        """Evaluate all lookups, and wait for them."""
+
+    def values(self) -> np.ndarray:
+        """What the last run found: B in 1/sr, shape (n, 3)."""
+
+
+class Evaluator(ABC):
+    """A representation as one evaluator computes it.
+
+    Parameters
+    ----------
+    representation : Representation
+    path : path-like, optional
+        Its file, for evaluators that load one.
+    filter_type : {"nearest", "bilinear"}, optional
+        In place of the representation's own texel filter.
+    """
+
+    def __init__(
+        self,
+        representation: Representation,
+        path: PathLike | None = None,
+        *,
+        filter_type: str | None = None,
+    ) -> None:
+        self.representation, self.path, self.filter_type = representation, path, filter_type
+
+    @abstractmethod
+    def prepare(
+        self, uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray, *, lod: ArrayLike | None = None
+    ) -> AbstractContextManager[Evaluation]:
+        """Set up lookups.
+
+        Parameters
+        ----------
+        uv : ndarray, shape (n, 2)
+        w_light, w_view : ndarray, shape (n, 3)
+            Local frame; ports round to float32. n is at least 1.
+        lod : array_like, optional
+            Level of detail of all lookups or of each, shape (n,); default the finest.
+
+        Returns
+        -------
+        context manager of Evaluation
+        """
+
+    @abstractmethod
+    def malformed(self, uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray) -> dict[str, int]:
+        """How many lookups ask for what is none, as :func:`btfref.conventions.malformed` counts them."""
+
+    def evaluate(
+        self, uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray, *, lod: ArrayLike | None = None
+    ) -> np.ndarray:
+        """Values of B in 1/sr, shape (n, 3), at the lookups of :meth:`prepare`."""
+        with self.prepare(uv, w_light, w_view, lod=lod) as evaluation:
+            evaluation.run()
+            return evaluation.values()
+
+
+class _Call:
+    """An `Evaluation` that is a function call, and its own context manager."""
+
+    def __init__(self, compute: Callable[[], JitArray], fetch: Callable[[JitArray], np.ndarray]) -> None:
+        self._compute, self._fetch, self._found = compute, fetch, None
+
+    def __enter__(self) -> _Call:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._found = None
+
+    def run(self) -> None:
+        self._found = self._compute()
+
+    def values(self) -> np.ndarray:
+        return self._fetch(self._found)
+
+
+class Definition(Evaluator):
+    """NumPy: the definition in float64, or what it gives where all its numbers are float32."""
+
+    def __init__(
+        self,
+        representation: Representation,
+        path: PathLike | None = None,
+        *,
+        filter_type: str | None = None,
+        dtype: DTypeLike = np.float64,
+    ) -> None:
+        if filter_type is not None:
+            meta = {**representation.meta, "filter_type": filter_type}
+            representation = type(representation).from_arrays(representation.arrays(), meta)
+        super().__init__(representation, path, filter_type=filter_type)
+        self._dtype = np.dtype(dtype)
+
+    def prepare(
+        self, uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray, *, lod: ArrayLike | None = None
+    ) -> _Call:
+        """Lookups, rounded to the precision; each run is one call of the definition."""
+        points = [np.asarray(a, self._dtype) for a in (uv, w_light, w_view)]
+        further = {} if lod is None else {"lod": lod}
+
+        def compute() -> np.ndarray:
+            with computing_in(self._dtype):
+                return self.representation.evaluate(*points, **further)
+
+        return _Call(compute, np.asarray)
+
+    def malformed(self, uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray) -> dict[str, int]:
+        """As NumPy counts them in that precision."""
+        with computing_in(self._dtype):
+            return conventions.malformed(uv, w_light, w_view)
+
+
+class DrJit(Evaluator):
+    """The plugin ``btf`` in Mitsuba, as the reference calls it.
+
+    Parameters
+    ----------
+    representation, path, filter_type
+        As of :class:`Evaluator`; the file is what is loaded.
+    fast : bool
+        Whether Dr.Jit may use approximate arithmetic (its flag ``FastMath``).
+    **parameters
+        Further ones of the plugin.
+    """
+
+    def __init__(
+        self,
+        representation: Representation,
+        path: PathLike | None = None,
+        *,
+        filter_type: str | None = None,
+        fast: bool = True,
+        **parameters: object,
+    ) -> None:
+        super().__init__(representation, path, filter_type=filter_type)
+        import mitsuba_plugins
+
+        if path is None:
+            raise InputError("the plugin loads a file, and none is given", field="path")
+        if filter_type is not None:
+            parameters["filter_type"] = filter_type
+        self._mi, self._fast = mitsuba_plugins.ready(), fast
+        self.plugin = mitsuba_plugins.load(path, **parameters)
+
+    def prepare(
+        self, uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray, *, lod: ArrayLike | None = None
+    ) -> _Call:
+        """Interactions on the device; each run evaluates the BSDF and waits."""
+        import drjit as dr
+
+        from mitsuba_plugins.protocol import LevelledEvaluator
+
+        mi, context = self._mi, self._mi.BSDFContext()
+        si = surface(mi, len(uv), np.asarray(uv).T, np.asarray(w_view).T)
+        light = mi.Vector3f(np.ascontiguousarray(np.asarray(w_light).T))
+        # A level for each lookup is no parameter of the plugin: it goes to the plugin's evaluator directly.
+        own_levels = lod is not None and isinstance(self.plugin.evaluator, LevelledEvaluator)
+        levels = (
+            mi.Float(np.broadcast_to(np.asarray(lod, np.float32), len(uv)).copy()) if own_levels else None
+        )
+        dr.eval(si, light, levels)
+
+        def compute() -> JitArray:
+            with dr.scoped_set_flag(dr.JitFlag.FastMath, self._fast):
+                value = (
+                    self._at_levels(si, light, levels) if own_levels else self.plugin.eval(context, si, light)
+                )
+                dr.eval(value)
+                dr.sync_thread()
+            return value
+
+        return _Call(compute, lambda value: np.array(value).T)
+
+    def _at_levels(self, si: JitArray, light: JitArray, levels: JitArray) -> JitArray:
+        import drjit as dr
+
+        from mitsuba_plugins.lib.lookup import valid_directions
+
+        valid = valid_directions(light) & valid_directions(si.wi)
+        up = self._mi.Vector3f(0, 0, 1)
+        light, view = dr.select(valid, light, up), dr.select(valid, si.wi, up)
+        return dr.select(valid, self.plugin.evaluator.evaluate(si.uv, light, view, valid, lod=levels), 0)
+
+    def malformed(self, uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray) -> dict[str, int]:
+        """As the plugin counts them."""
+        import drjit as dr
+
+        from mitsuba_plugins.lib.lookup import malformed
+
+        mi = self._mi
+        at, light, view = (np.ascontiguousarray(np.asarray(a).T) for a in (uv, w_light, w_view))
+        with dr.scoped_set_flag(dr.JitFlag.FastMath, self._fast):
+            found = malformed(mi.Point2f(at), mi.Vector3f(light), mi.Vector3f(view))
+            counts = [int(np.count_nonzero(np.array(mask))) for mask in found]
+        return dict(zip(("directions", "coordinates"), counts, strict=True))
+
+
+class Glsl(Evaluator):
+    """The shaders in OpenGL, one vertex a lookup."""
+
+    def prepare(
+        self, uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray, *, lod: ArrayLike | None = None
+    ) -> AbstractContextManager[Evaluation]:
+        """Buffers and a program on the GPU; each run draws them."""
+        from btfref.rendering.gl.probe import broadcast_points, probe_points
+
+        rows, _ = broadcast_points(uv, w_light, w_view, 0.0 if lod is None else lod)
+        return probe_points(self.representation, rows, filter_type=self.filter_type)
+
+    def malformed(self, uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray) -> dict[str, int]:
+        """As the shader counts them."""
+        from btfref.rendering.gl.probe import probe_malformed
+
+        return probe_malformed(self.representation, uv, w_light, w_view)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One evaluator of the table.
+
+    Attributes
+    ----------
+    title : str
+        For people.
+    make : callable
+        As :class:`Evaluator`: ``(representation, path, *, filter_type=None) -> Evaluator``.
+    port : bool
+        Whether a renderer runs it. The others show what precision and compiler make of the same code.
+    compiles : bool
+        Whether every material is compiled first, which takes seconds.
+    needs : str or None
+        What it needs beyond the package: "llvm", "gl".
+    """
+
+    title: str
+    make: Callable[..., Evaluator]
+    port: bool = False
+    compiles: bool = False
+    needs: str | None = None
+
+
+#: What all others are measured against.
+DEFINITION = "numpy"
+
+#: All evaluators by name, the definition first.
+EVALUATORS = {
+    DEFINITION: Row("NumPy", Definition),
+    "numpy float32": Row("NumPy in single precision", partial(Definition, dtype=np.float32)),
+    "drjit": Row("Dr.Jit", DrJit, port=True, compiles=True, needs="llvm"),
+    "drjit without FastMath": Row(
+        "Dr.Jit without fast math", partial(DrJit, fast=False), compiles=True, needs="llvm"
+    ),
+    "glsl": Row("GLSL", Glsl, port=True, needs="gl"),
+}
+
+#: Those that are measured against the definition.
+MEASURED = tuple(name for name in EVALUATORS if name != DEFINITION)
+
+#: Those that renderers run.
+PORTS = tuple(name for name, row in EVALUATORS.items() if row.port)
+
+
+def evaluator(
+    name: str, representation: Representation, path: PathLike | None = None, **parameters: object
+) -> Evaluator:
+    """An evaluator of a representation.
 
     Parameters
     ----------
     name : str
-        One of ``PORTS``.
+        Key of :data:`EVALUATORS`.
     representation : Representation
-    path : path-like
-        Its file.
+    path : path-like, optional
+        Its file: Dr.Jit loads it.
+    **parameters
+        ``filter_type``, and what else that evaluator takes.
 
     Returns
     -------
-    callable
-        ``Lookups -> ndarray of float32, shape (n, 3)``.
+    Evaluator
 
     Raises
     ------
     InputError
         Unknown name.
+    MissingDependencyError
+        Without LLVM or OpenGL, here or when it is first used.
     """
-    if name == "glsl":
-        return _glsl(representation)
-    if name == "numpy float32":
-        return _single(representation)
-    if name in ("drjit", "drjit without FastMath"):
-        return _drjit(path, fast=name == "drjit")
-    raise InputError("unknown evaluator", field="--evaluator", got=repr(name), expected=", ".join(PORTS))
+    if name not in EVALUATORS:
+        raise InputError(
+            "unknown evaluator", field="--evaluator", got=repr(name), expected=", ".join(EVALUATORS)
+        )
+    return EVALUATORS[name].make(representation, path, **parameters)
 
 
-def count_malformed(name, representation, lookups):
-    """Malformed lookups as a port counts them.
+def surface(mi: ModuleType, n: int, uv: ArrayLike, w_view: ArrayLike) -> JitArray:
+    """Surface interactions in their own frame.
 
     Parameters
     ----------
-    name : str
-        One of ``PORTS``.
-    representation : Representation
-    lookups : Lookups
+    mi : module
+        Mitsuba with a JIT variant.
+    n : int
+        How many.
+    uv : array_like, shape (2,) or (2, n)
+    w_view : array_like, shape (3,) or (3, n)
 
     Returns
     -------
-    dict of str to int
-        As :func:`btfref.conventions.malformed`.
+    mitsuba.SurfaceInteraction3f
     """
-    if name == "glsl":
-        from btfref.rendering.gl.probe import probe_malformed
-
-        return probe_malformed(representation, *lookups.points)
-    if name == "numpy float32":
-        from btfref.precision import computing_in
-
-        with computing_in(np.float32):
-            return conventions.malformed(*lookups.points)
-    dr, mi = _mitsuba()
-    from mitsuba_plugins.lib.lookup import malformed
-
-    uv, light, view = (np.ascontiguousarray(a.T) for a in lookups.points)
-    with dr.scoped_set_flag(dr.JitFlag.FastMath, name == "drjit"):
-        found = malformed(mi.Point2f(uv), mi.Vector3f(light), mi.Vector3f(view))
-        counts = [int(np.count_nonzero(np.array(mask))) for mask in found]
-    return dict(zip(("directions", "coordinates"), counts, strict=True))
-
-
-def _single(representation):
-    from btfref.precision import computing_in
-
-    def evaluate(lookups):
-        with computing_in(np.float32):
-            return definition(representation, lookups)
-
-    return evaluate
-
-
-def _glsl(representation):
-    from btfref.rendering.gl.probe import probe
-
-    return lambda lookups: probe(representation, *lookups.points, lookups.lod)
-
-
-def _mitsuba():
-    """Dr.Jit and Mitsuba in a variant of its compiler."""
-    from btfref.platform import prepare_llvm
-
-    prepare_llvm()
     import drjit as dr
-    import mitsuba as mi
 
-    if mi.variant() is None or mi.variant().startswith("scalar"):
-        mi.set_variant("llvm_ad_rgb")
-    return dr, mi
+    def column(values: np.ndarray) -> JitArray:
+        # A single place is data, not code: one kernel serves all.
+        return dr.opaque(mi.Float, float(values)) if np.ndim(values) == 0 else mi.Float(values)
 
-
-def _drjit(path, *, fast):
-    dr, mi = _mitsuba()
-    import mitsuba_plugins
-    from mitsuba_plugins.protocol import LevelledEvaluator
-
-    mitsuba_plugins.register()
-    # The level is fixed to 0 here; other levels go to the plugin's evaluator directly.
-    bsdf = mi.load_dict({"type": "btf", "filename": str(path), "lod": "none"})
-    levelled = isinstance(bsdf.evaluator, LevelledEvaluator)
-
-    def evaluate(lookups):
-        from mitsuba_plugins.lib.lookup import valid_directions
-
-        uv, light, view = (np.ascontiguousarray(a.T) for a in lookups.points)
-        with dr.scoped_set_flag(dr.JitFlag.FastMath, fast):
-            light = mi.Vector3f(light)
-            if not levelled:
-                si = dr.zeros(mi.SurfaceInteraction3f, len(lookups))
-                si.uv, si.wi = mi.Point2f(uv), mi.Vector3f(view)
-                return np.array(bsdf.eval(mi.BSDFContext(), si, light)).T
-            view = mi.Vector3f(view)
-            valid = valid_directions(light) & valid_directions(view)
-            up = mi.Vector3f(0, 0, 1)
-            light, view = dr.select(valid, light, up), dr.select(valid, view, up)
-            value = bsdf.evaluator.evaluate(mi.Point2f(uv), light, view, valid, lod=mi.Float(lookups.lod))
-            return np.array(dr.select(valid, value, 0)).T
-
-    return evaluate
+    si = dr.zeros(mi.SurfaceInteraction3f, n)
+    si.uv = mi.Point2f(*map(column, np.asarray(uv)))
+    si.wi = mi.Vector3f(*map(column, np.asarray(w_view)))
+    return si

@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from btfref.comparison.comparison import agreement
 from btfref.gates.tolerances import tolerance, tolerance_of
+from btfref.representations.protocol import Spreads
+
+if TYPE_CHECKING:
+    from btfref.comparison import Comparison
+    from btfref.representations.protocol import Representation
+    from btfref.stress.lookups import Lookups
+    from btfref.types import Facts
 
 #: Random points of the box of rounded arguments among which a differing value is looked for.
 NEIGHBOURS = 256
@@ -48,19 +58,30 @@ class Finding:
     explained: int = 0
     where: str = ""
     reproducer: str = ""
-    detail: dict | None = None
+    detail: Facts | None = None
 
     @property
-    def passed(self):
+    def passed(self) -> bool:
         """Whether no case failed."""
         return not self.failures
 
-    def to_dict(self):
+    def to_dict(self) -> Facts:
         """JSON-able."""
         return asdict(self) | {"passed": self.passed}
 
 
-def limit_finding(check, method, data, worst, key, *, evaluator="definition", cases=1, where="", detail=None):
+def limit_finding(
+    check: str,
+    method: str,
+    data: str,
+    worst: float,
+    key: str,
+    *,
+    evaluator: str = "definition",
+    cases: int = 1,
+    where: str = "",
+    detail: Facts | None = None,
+) -> Finding:
     """A finding of one number with an upper limit in ``tolerances.toml``, the method's own if it has one; NaN fails."""
     bound = tolerance_of(method, key)
     return Finding(
@@ -79,7 +100,9 @@ def limit_finding(check, method, data, worst, key, *, evaluator="definition", ca
     )
 
 
-def judge_values(value, reference, representation, lookups, gate):
+def judge_values(
+    value: np.ndarray, reference: np.ndarray, representation: Representation, lookups: Lookups, gate: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Compare a port's values with the definition's.
 
     A value passes when it is finite and within the gate's relative ``max`` of the definition, or of a value that the
@@ -125,14 +148,53 @@ def judge_values(value, reference, representation, lookups, gate):
     return failed, explained, error, ulps
 
 
-def valid_lookups(lookups):
+def port_agreement(
+    value: np.ndarray,
+    representation: Representation,
+    points: tuple[np.ndarray, np.ndarray, np.ndarray],
+    lod: ArrayLike = 0.0,
+    *,
+    gate: str = "probe.agreement",
+) -> Comparison:
+    """A port's values against the definition's, by the distribution of their relative error.
+
+    Where the method has geometry, differences within the stated tolerance of a hit are allowed; but where a port and
+    the definition agree to float32 anyway nothing is needed, and nothing is allowed.
+
+    Parameters
+    ----------
+    value : ndarray, shape (n, 3)
+    representation : Representation
+    points : tuple of ndarray
+        ``uv``, ``w_light``, ``w_view``.
+    lod : array_like
+    gate : str
+        Key of ``tolerances.toml``.
+
+    Returns
+    -------
+    Comparison
+    """
+    reference = representation.evaluate(*points, lod=lod)
+    allowance = None
+    if isinstance(representation, Spreads):
+        scale = np.maximum(np.abs(reference), 1e-3 * np.abs(reference).max())
+        differs = (np.abs(np.reshape(value, reference.shape) - reference) > 1e-6 * scale).any(-1)
+        allowance = np.zeros_like(reference)
+        allowance[differs] = representation.spread(*(a[differs] for a in points))
+    return agreement(value, reference, gate=gate, allowance=allowance)
+
+
+def valid_lookups(lookups: Lookups) -> np.ndarray:
     """Where both directions of a lookup count, shape (n,)."""
     from btfref.conventions import valid_directions
 
     return valid_directions(lookups.w_light) & valid_directions(lookups.w_view)
 
 
-def rounded_range(representation, lookups, ulps):
+def rounded_range(
+    representation: Representation, lookups: Lookups, ulps: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Least and largest value of the definition at arguments that are off by their rounding.
 
     Directions move by ``ulps`` roundoffs of 1 along each axis, coordinates by as many of themselves or of a tile,

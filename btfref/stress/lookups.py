@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from btfref.numerics.sphere import interpolation
+from btfref.representations.protocol import max_lod
+
+if TYPE_CHECKING:
+    from btfref.representations.protocol import Representation
 
 #: Lookups of a block.
 BLOCK = 4096
@@ -56,18 +63,18 @@ class Lookups:
     coordinate: np.ndarray
     relation: np.ndarray
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.uv)
 
-    def __getitem__(self, index):
+    def __getitem__(self, index: np.ndarray) -> Lookups:
         return Lookups(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
     @property
-    def points(self):
+    def points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Arguments of ``evaluate`` without the level of detail."""
         return self.uv, self.w_light, self.w_view
 
-    def where(self, i):
+    def where(self, i: int) -> str:
         """How lookup ``i`` was drawn, for people."""
         text = f"light: {DIRECTIONS[self.light[i]]}; view: {DIRECTIONS[self.view[i]]}"
         if self.relation[i]:
@@ -75,7 +82,39 @@ class Lookups:
         return f"{text}; uv: {COORDINATES[self.coordinate[i]]}"
 
 
-def block(representation, seed, number, n=BLOCK):
+@dataclass(frozen=True)
+class Mix:
+    """What lookups are drawn from.
+
+    Attributes
+    ----------
+    directions, coordinates : tuple of str
+        Of ``DIRECTIONS`` and ``COORDINATES``, each as often as the others.
+    related : float
+        Share of lookups whose directions depend on each other.
+    broken : bool
+        Whether levels of detail may be anything that a float can be; else they are those that there are.
+    """
+
+    directions: tuple[str, ...] = DIRECTIONS
+    coordinates: tuple[str, ...] = COORDINATES
+    related: float = 1 / 3
+    broken: bool = True
+
+
+#: All that a port must survive.
+EVERYTHING = Mix()
+
+#: What a renderer asks for, the hard places among it: here a port meets the gates without excuse.
+USUAL = Mix(
+    ("anywhere", "grazing", "pole", "sample", "between samples", "edge", "seam", "ring"),
+    ("anywhere", "negative", "centre", "border", "wrap"),
+    related=0.0,
+    broken=False,
+)
+
+
+def block(representation: Representation, seed: int, number: int, n: int = BLOCK) -> Lookups:
     """Lookups of block ``number`` for a representation: its own directions, rings, edges and texels.
 
     Parameters
@@ -88,39 +127,73 @@ def block(representation, seed, number, n=BLOCK):
     -------
     Lookups
     """
-    rng = np.random.default_rng([seed, number])
+    return hard_lookups(np.random.default_rng([seed, number]), representation, n)
+
+
+def hard_lookups(
+    rng: np.random.Generator, representation: Representation, n: int, mix: Mix = EVERYTHING
+) -> Lookups:
+    """Random lookups at the hard places of a representation.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    representation : Representation
+    n : int
+    mix : Mix
+
+    Returns
+    -------
+    Lookups
+    """
     arrays = representation.arrays()
     drawn, kinds = {}, {}
     for prefix in ("light", "view"):
-        kinds[prefix] = rng.integers(0, len(DIRECTIONS), n).astype(np.uint8)
+        kinds[prefix] = _kinds(rng, mix.directions, DIRECTIONS, n)
         drawn[prefix] = _directions(rng, kinds[prefix], arrays, prefix)
-    # In a third of all lookups both directions depend on each other.
-    relation = np.where(rng.random(n) < 1 / 3, rng.integers(1, len(RELATIONS), n), 0).astype(np.uint8)
+    relation = np.where(rng.random(n) < mix.related, rng.integers(1, len(RELATIONS), n), 0).astype(np.uint8)
     related = relation > 0
     sign = np.where(relation == RELATIONS.index("mirrored"), -1, 1)[:, None] * [1, 1, 0] + [0, 0, 1]
     sign = np.where(relation[:, None] == RELATIONS.index("equal"), 1, sign)
     with np.errstate(invalid="ignore"):
         drawn["light"] = np.where(related[:, None], drawn["view"] * sign.astype(np.float32), drawn["light"])
-    coordinate = rng.integers(0, len(COORDINATES), n).astype(np.uint8)
+    coordinate = _kinds(rng, mix.coordinates, COORDINATES, n)
     uv = _coordinates(rng, coordinate, representation.meta["texels"])
-    lod = np.where(rng.random(n) < 0.5, 0, rng.uniform(-1, 6, n))
-    odd = rng.random(n) < 0.1
-    lod = np.where(odd, rng.choice([-1e30, 1e30, np.inf, -np.inf, np.nan, 3.0, _TINY], n), lod)
+    lod = _levels(rng, n) if mix.broken else rng.uniform(0, max_lod(representation), n)
     return Lookups(
-        uv, drawn["light"], drawn["view"], lod.astype(np.float32), *kinds.values(), coordinate, relation
+        uv=uv,
+        w_light=drawn["light"],
+        w_view=drawn["view"],
+        lod=lod.astype(np.float32),
+        **kinds,
+        coordinate=coordinate,
+        relation=relation,
     )
 
 
-def _directions(rng, kind, arrays, prefix):
+def _kinds(rng: np.random.Generator, chosen: tuple[str, ...], names: tuple[str, ...], n: int) -> np.ndarray:
+    """Indices into ``names``, of the chosen ones alone, shape (n,)."""
+    index = np.array([names.index(name) for name in chosen])
+    return index[rng.integers(0, len(chosen), n)].astype(np.uint8)
+
+
+def _levels(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Levels of detail: the finest, others, levels that there are not, and what is no number; shape (n,)."""
+    lod = np.where(rng.random(n) < 0.5, 0, rng.uniform(-1, 6, n))
+    odd = rng.random(n) < 0.1
+    return np.where(odd, rng.choice([-1e30, 1e30, np.inf, -np.inf, np.nan, 3.0, _TINY], n), lod)
+
+
+def _directions(
+    rng: np.random.Generator, kind: np.ndarray, arrays: Mapping[str, np.ndarray], prefix: str
+) -> np.ndarray:
     """Directions of the kinds of ``DIRECTIONS``, rounded to float32."""
     n = len(kind)
-    w = rng.normal(size=(n, 3))
-    w[:, 2] = np.abs(w[:, 2])
-    w = unit(w)
+    w = hemisphere(rng, n, float)
     samples = arrays[f"{prefix}_directions"].astype(float)
     some = rng.integers(0, len(samples), (2, n))
 
-    def of(name):
+    def of(name: str) -> np.ndarray:
         return kind == DIRECTIONS.index(name)
 
     # Down to 1e-8 of a radian above the horizon, and as near to the pole.
@@ -184,7 +257,7 @@ _NOT_DIRECTIONS = np.array(
 )
 
 
-def _on_edges(rng, n, arrays, prefix):
+def _on_edges(rng: np.random.Generator, n: int, arrays: Mapping[str, np.ndarray], prefix: str) -> np.ndarray:
     """Directions on borders between cells of the interpolation: edges of triangles, or azimuths of ring samples."""
     table = interpolation.whole(interpolation.from_arrays(arrays, prefix))
     if isinstance(table, interpolation.TriangleInterpolation):
@@ -197,7 +270,7 @@ def _on_edges(rng, n, arrays, prefix):
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
 
 
-def _coordinates(rng, kind, shape):
+def _coordinates(rng: np.random.Generator, kind: np.ndarray, shape: Sequence[int]) -> np.ndarray:
     n, size = len(kind), np.array(shape[::-1], float)
     uv = rng.uniform(0, 1, (n, 2))
     texel = np.floor(uv * size)
@@ -216,7 +289,14 @@ def _coordinates(rng, kind, shape):
     return uv.astype(np.float32)
 
 
-def unit(w):
+def hemisphere(rng: np.random.Generator, n: int, dtype: DTypeLike = np.float32) -> np.ndarray:
+    """Uniform directions on the upper hemisphere, rounded to ``dtype``, shape (n, 3)."""
+    w = rng.normal(size=(n, 3))
+    w[:, 2] = np.abs(w[:, 2])
+    return unit(w).astype(dtype)
+
+
+def unit(w: np.ndarray) -> np.ndarray:
     """Rows of length 1; zero rows stay."""
     length = np.linalg.norm(w, axis=-1, keepdims=True)
     return w / np.where(length > 0, length, 1)

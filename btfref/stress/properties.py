@@ -8,8 +8,12 @@ from __future__ import annotations
 
 import inspect
 import itertools
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
@@ -17,8 +21,12 @@ from btfref.numerics.sphere.directions import DirectionSet, directions
 from btfref.representations.protocol import Spreads
 from btfref.sampling import SampledBTF
 from btfref.stress.data import make
-from btfref.stress.judging import limit_finding
+from btfref.stress.judging import Finding, limit_finding, valid_lookups
 from btfref.stress.lookups import block, unit
+
+if TYPE_CHECKING:
+    from btfref.registry import Method
+    from btfref.representations.protocol import Representation
 
 #: Parameters of fits that say how much a representation may hold, and what is tried of each.
 SIZES = {"components": (1, 2, 4, 8), "lobes": (1, 2, 4), "clusters": (1, 4, 16), "terms": (1, 2)}
@@ -33,7 +41,7 @@ SAMPLES = 8192
 STEP = 1e-9
 
 
-def sample_error(representation, btf, *, seed=0):
+def sample_error(representation: Representation | _Moved, btf: SampledBTF, *, seed: int = 0) -> float:
     """Relative RMS difference between a representation and its data at random samples; 0 for black data met exactly."""
     value, reference = _at_samples(representation, btf, seed)
     scale = np.sqrt((reference**2).mean())
@@ -41,7 +49,9 @@ def sample_error(representation, btf, *, seed=0):
     return float(error / scale) if scale > 0 else float(error)
 
 
-def _at_samples(representation, btf, seed=0, turned=False):
+def _at_samples(
+    representation: Representation | _Moved, btf: SampledBTF, seed: int = 0, turned: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     rows, columns = btf.texels
     v, light, r, c = (rng.integers(0, n, SAMPLES) for n in btf.values.shape[:4])
@@ -53,7 +63,7 @@ def _at_samples(representation, btf, seed=0, turned=False):
     return value, btf.values[v, light, r, c].astype(float)
 
 
-def deterministic(method, btf, name):
+def deterministic(method: Method, btf: SampledBTF, name: str) -> Iterator[Finding]:
     """Two fits with one seed hold the same bytes."""
     one, two = (method.fit(btf, seed=1).arrays() for _ in range(2))
     different = [k for k in one if one[k].tobytes() != two[k].tobytes()]
@@ -63,7 +73,7 @@ def deterministic(method, btf, name):
     )  # fmt: skip
 
 
-def monotone(method, btf, name):
+def monotone(method: Method, btf: SampledBTF, name: str) -> Iterator[Finding]:
     """More components, lobes or clusters do not raise the error."""
     parameters = inspect.signature(method.fit).parameters
     for size, steps in SIZES.items():
@@ -81,14 +91,21 @@ def monotone(method, btf, name):
         )  # fmt: skip
 
 
-def symmetric(method, btf, name):
+def symmetric(method: Method, btf: SampledBTF, name: str) -> Iterator[Finding]:
     """Scaled channels, shifted texels, and the whole material turned by half a turn."""
     plain = method.fit(btf)
     own, _ = _at_samples(plain, btf)
     scale = max(np.sqrt((own**2).mean()), 1e-300)
     error = sample_error(plain, btf)
 
-    def finding(check, value, other_btf, key, other, errors):
+    def finding(
+        check: str,
+        value: np.ndarray,
+        other_btf: SampledBTF,
+        key: str,
+        other: Representation,
+        errors: Sequence[float],
+    ) -> Finding:
         change = np.sqrt(((value - own) ** 2).mean()) / scale
         other_error = sample_error(other, other_btf)
         low, high = (max(e, 1e-3) for e in (min(errors), max(errors)))
@@ -125,18 +142,18 @@ def symmetric(method, btf, name):
 class _Moved:
     """A representation whose arguments are changed before it is evaluated."""
 
-    def __init__(self, representation, change):
+    def __init__(self, representation: Representation, change: Callable[..., tuple[np.ndarray, ...]]) -> None:
         self._representation, self._change = representation, change
 
-    def evaluate(self, *points, **further):
+    def evaluate(self, *points: ArrayLike, **further: ArrayLike) -> np.ndarray:
         return self._representation.evaluate(*self._change(*points), **further)
 
 
-def _with(btf, values):
+def _with(btf: SampledBTF, values: np.ndarray) -> SampledBTF:
     return SampledBTF(values, btf.views, btf.lights, attributes=btf.attributes)
 
 
-def half_turn(btf):
+def half_turn(btf: SampledBTF) -> SampledBTF | None:
     """The material turned by π about its normal, on the same directions; None where these have no such symmetry."""
     values = btf.values[:, :, ::-1, ::-1]
     for axis, chosen in enumerate((btf.views, btf.lights)):
@@ -148,15 +165,15 @@ def half_turn(btf):
     return _with(btf, np.ascontiguousarray(values))
 
 
-def continuous(method, representation, name, *, seed=0, blocks=1):
+def continuous(
+    method: Method, representation: Representation, name: str, *, seed: int = 0, blocks: int = 1
+) -> Iterator[Finding]:
     """No jumps where cells of directions, rings, seams, tiles and levels meet.
 
     A height field's silhouettes and shadows are jumps by nature: where it has them (`Spreads`) nothing is asked.
     """
     if isinstance(representation, Spreads) or representation.meta["filter_type"] != "bilinear":
         return
-    from btfref.stress.judging import valid_lookups
-
     worst, where, cases = 0.0, "", 0
     for number in range(blocks):
         lookups = block(representation, seed, number)
@@ -183,7 +200,13 @@ def continuous(method, representation, name, *, seed=0, blocks=1):
     )
 
 
-def energy(method, representation, btf, name, key="stress.energy.relative"):
+def energy(
+    method: Method,
+    representation: Representation,
+    btf: SampledBTF,
+    name: str,
+    key: str = "stress.energy.relative",
+) -> Iterator[Finding]:
     """The mean over the tile and all pairs of directions, against the data's; ``key`` names the bound."""
     value, reference = _at_samples(representation, btf)
     mean = abs(reference.mean())
@@ -191,7 +214,7 @@ def energy(method, representation, btf, name, key="stress.energy.relative"):
     yield limit_finding("energy of the tile", method.key, name, worst, key, cases=SAMPLES)
 
 
-def overflow(method):
+def overflow(method: Method) -> Iterator[Finding]:
     """Values beyond the stored type: refused, or kept in a type that holds them; never a silent infinity."""
     for name in ("huge", "wide range"):
         btf = make(name)
@@ -211,7 +234,7 @@ def overflow(method):
         )
 
 
-def refuses_nan(method, folder):
+def refuses_nan(method: Method, folder: Path) -> Iterator[Finding]:
     """Data with NaN: the store does not take them, and no fit makes numbers of them."""
     btf = make("bumpy")
     values = btf.values.copy()
@@ -227,7 +250,9 @@ def refuses_nan(method, folder):
     yield limit_finding("NaN refused", method.key, "NaN texel", silent, "stress.refusal.silent", cases=2)
 
 
-def partition_of_unity(spec, name, *, seed=0, n=100_000):
+def partition_of_unity(
+    spec: str | DirectionSet | np.ndarray, name: str, *, seed: int = 0, n: int = 100_000
+) -> Iterator[Finding]:
     """Weights of directions: not negative, sum 1 for views, and for lights the fade towards the horizon."""
     chosen = spec if isinstance(spec, DirectionSet) else directions(spec)
     rng = np.random.default_rng(seed)

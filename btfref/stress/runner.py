@@ -5,7 +5,9 @@ from __future__ import annotations
 import inspect
 import shlex
 import tempfile
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,9 +17,13 @@ from btfref.gates.tolerances import tolerance
 from btfref.registry import method, methods
 from btfref.stress import properties
 from btfref.stress.data import DATA, make, scattered
-from btfref.stress.evaluators import PORTS, count_malformed, definition, port
+from btfref.stress.evaluators import DEFINITION, EVALUATORS, MEASURED, Evaluator, evaluator
 from btfref.stress.judging import Finding, judge_values, limit_finding, valid_lookups
-from btfref.stress.lookups import BLOCK, block
+from btfref.stress.lookups import BLOCK, Lookups, block
+
+if TYPE_CHECKING:
+    from btfref.representations.protocol import Representation
+    from btfref.types import Facts, Progress
 
 #: Data whose kernels the path tracer's port is compiled for in a short run, and blocks of lookups of each in both.
 SHORT_DATA, SHORT_BLOCKS, LONG_BLOCKS = ("bumpy", "scattered", "wide range"), 1, 4
@@ -29,7 +35,15 @@ STORAGES = ("half", "float", "byte")
 PROPERTY_DATA = ("bumpy",)
 
 
-def run(*, only=None, data=None, evaluators=None, long=False, seed=0, progress=None):
+def run(
+    *,
+    only: Iterable[str] | None = None,
+    data: Iterable[str] | None = None,
+    evaluators: Iterable[str] | None = None,
+    long: bool = False,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Facts:
     """All checks.
 
     Parameters
@@ -61,20 +75,21 @@ def run(*, only=None, data=None, evaluators=None, long=False, seed=0, progress=N
     for name in names:
         if name not in DATA:
             raise InputError("unknown data", field="--data", got=repr(name), expected=", ".join(DATA))
-    ports = PORTS if evaluators is None else tuple(evaluators)
+    ports = MEASURED if evaluators is None else tuple(evaluators)
     for name in ports:
-        if name not in PORTS:
+        if name not in MEASURED:
             raise InputError(
-                "unknown evaluator", field="--evaluator", got=repr(name), expected=", ".join(PORTS)
+                "unknown evaluator", field="--evaluator", got=repr(name), expected=", ".join(MEASURED)
             )
     report = progress or (lambda *_: None)
-    findings, total = [], len(keys) * (len(names) + (data is None))
+    findings: list[Finding] = []
+    total = len(keys) * (len(names) + (data is None))
     for i, key in enumerate(keys):
         for j, name in enumerate(names):
             report(i * (total // len(keys)) + j, total, f"{key}, {name}")
-            # The definition always runs; ports that need a compiler only where the run is long or the data ask for it.
-            chosen = ports if long or data is not None or name in SHORT_DATA else ("numpy float32", "glsl")
-            some = [p for p in ports if p in chosen]
+            # The definition always runs; what compiles only where the run is long or the data ask for it.
+            every = long or data is not None or name in SHORT_DATA
+            some = [p for p in ports if every or not EVALUATORS[p].compiles]
             findings += stress_data(key, name, some, seed=seed, long=long)
         if data is None:
             report((i + 1) * (total // len(keys)) - 1, total, f"{key}, fits")
@@ -92,7 +107,9 @@ def run(*, only=None, data=None, evaluators=None, long=False, seed=0, progress=N
     }
 
 
-def stress_data(key, name, ports, *, seed=0, long=False):
+def stress_data(
+    key: str, name: str, ports: Iterable[str], *, seed: int = 0, long: bool = False
+) -> Iterator[Finding]:
     """Fit one method to one data set, or see it refuse; then all its lookups.
 
     Yields
@@ -101,7 +118,7 @@ def stress_data(key, name, ports, *, seed=0, long=False):
     """
     row = method(key)
     btf = make(name, seed)
-    kinds = [None]
+    kinds: list[str | None] = [None]
     if long and name in SHORT_DATA and "storage" in inspect.signature(row.fit).parameters:
         kinds += STORAGES
     for kind in kinds:
@@ -118,7 +135,15 @@ def stress_data(key, name, ports, *, seed=0, long=False):
             yield from properties.continuous(row, made, label, seed=seed)
 
 
-def stress_lookups(representation, name, ports, *, seed=0, blocks=1, n=BLOCK):
+def stress_lookups(
+    representation: Representation,
+    name: str,
+    ports: Iterable[str],
+    *,
+    seed: int = 0,
+    blocks: int = 1,
+    n: int = BLOCK,
+) -> Iterator[Finding]:
     """Blocks of lookups through the definition and the ports.
 
     Parameters
@@ -142,16 +167,22 @@ def stress_lookups(representation, name, ports, *, seed=0, blocks=1, n=BLOCK):
         # What the ports see is what was stored.
         representation = load(path)
         sets = [block(representation, seed, number, n) for number in range(blocks)]
-        references = [definition(representation, lookups) for lookups in sets]
+        references = _values(evaluator(DEFINITION, representation, path), sets)
         yield _definition_finding(representation, name, sets, references)
-        for evaluator in ports:
-            evaluate = port(evaluator, representation, path)
-            values = [evaluate(lookups) for lookups in sets]
-            yield _port_finding(representation, name, evaluator, sets, references, values, seed)
-            yield _count_finding(representation, name, evaluator, sets)
+        for which in ports:
+            port = evaluator(which, representation, path)
+            values = _values(port, sets)
+            yield _port_finding(representation, name, which, sets, references, values, seed)
+            yield _count_finding(representation, name, which, sets, port)
 
 
-def _definition_finding(representation, name, sets, references):
+def _values(port: Evaluator, sets: Sequence[Lookups]) -> list[np.ndarray]:
+    return [port.evaluate(*lookups.points, lod=lookups.lod) for lookups in sets]
+
+
+def _definition_finding(
+    representation: Representation, name: str, sets: Sequence[Lookups], references: Sequence[np.ndarray]
+) -> Finding:
     """The definition is finite, and exactly 0 where a direction is none; its sign is what its class says."""
     key = representation.meta["method"]
     bad, where = 0, ""
@@ -170,20 +201,30 @@ def _definition_finding(representation, name, sets, references):
     )  # fmt: skip
 
 
-def _count_finding(representation, name, evaluator, sets):
+def _count_finding(
+    representation: Representation, name: str, which: str, sets: Sequence[Lookups], port: Evaluator
+) -> Finding:
     """Lookups that ask for what is none are counted alike by all evaluators; their values are exactly 0."""
     expected = [malformed(*lookups.points) for lookups in sets]
-    found = [count_malformed(evaluator, representation, lookups) for lookups in sets]
+    found = [port.malformed(*lookups.points) for lookups in sets]
     off = sum(abs(a[kind] - b[kind]) for a, b in zip(expected, found, strict=True) for kind in a)
     totals = {kind: sum(counts[kind] for counts in expected) for kind in expected[0]}
     return limit_finding(
         "malformed counted", representation.meta["method"], name, off, "stress.malformed.off",
-        evaluator=evaluator, cases=sum(len(s) for s in sets),
+        evaluator=which, cases=sum(len(s) for s in sets),
         where=", ".join(f"{n} {kind}" for kind, n in totals.items()), detail=totals,
     )  # fmt: skip
 
 
-def _port_finding(representation, name, evaluator, sets, references, values, seed):
+def _port_finding(
+    representation: Representation,
+    name: str,
+    which: str,
+    sets: Sequence[Lookups],
+    references: Sequence[np.ndarray],
+    values: Sequence[np.ndarray],
+    seed: int,
+) -> Finding:
     key = representation.meta["method"]
     results = [
         judge_values(value, reference, representation, lookups, "stress.ports")
@@ -202,14 +243,14 @@ def _port_finding(representation, name, evaluator, sets, references, values, see
         "worst_explained": float(error[explained].max(initial=0)),
     }
     plain = np.where(explained, 0, error)
-    command = ["btfref", "stress", "--only", key, "--data", name.partition(",")[0], "--evaluator", evaluator]
+    command = ["btfref", "stress", "--only", key, "--data", name.partition(",")[0], "--evaluator", which]
     command += ["--seed", str(seed), "--case", f"{number}:{index}:{len(sets[number])}"]
     if ", " in name:
         command += ["--storage", name.partition(", ")[2]]
     return Finding(
         "port",
         key,
-        evaluator,
+        which,
         name,
         len(error),
         float(plain.max(initial=0)),
@@ -222,7 +263,7 @@ def _port_finding(representation, name, evaluator, sets, references, values, see
     )
 
 
-def _locate(sets, index):
+def _locate(sets: Sequence[Lookups], index: int) -> tuple[int, int]:
     for number, lookups in enumerate(sets):
         if index < len(lookups):
             return number, index
@@ -230,7 +271,7 @@ def _locate(sets, index):
     raise IndexError(index)
 
 
-def _distribution(values):
+def _distribution(values: np.ndarray) -> dict[str, float]:
     """Percentiles of errors of valid lookups."""
     if not len(values):
         return {}
@@ -240,7 +281,7 @@ def _distribution(values):
     return {name: float(ordered[int(np.ceil(p / 100 * len(ordered))) - 1]) for name, p in names.items()}
 
 
-def stress_fits(key):
+def stress_fits(key: str) -> Iterator[Finding]:
     """The checks of a method's fit itself.
 
     Yields
@@ -261,7 +302,7 @@ def stress_fits(key):
         yield from properties.refuses_nan(row, Path(folder))
 
 
-def stress_directions():
+def stress_directions() -> Iterator[Finding]:
     """Partition of unity on direction sets with and without rings.
 
     Yields
@@ -273,12 +314,15 @@ def stress_directions():
     yield from properties.partition_of_unity(scattered(0), "scattered")
 
 
-def show_case(key, name, evaluator, case, *, seed=0, storage=None):
+def show_case(
+    key: str, name: str, port: str, case: str, *, seed: int = 0, storage: str | None = None
+) -> Facts:
     """One lookup again: what a reproducer prints.
 
     Parameters
     ----------
-    key, name, evaluator : str
+    key, name, port : str
+        Method, data and evaluator.
     case : str
         ``block:index:size`` as a reproducer has it.
     seed : int
@@ -306,8 +350,9 @@ def show_case(key, name, evaluator, case, *, seed=0, storage=None):
         save(method(key).fit(make(name, seed), **further), path)
         representation = load(path)
         lookups = block(representation, seed, number, n)
-        reference = definition(representation, lookups)
-        value = port(evaluator, representation, path)(lookups)
+        reference, value = (
+            _values(evaluator(which, representation, path), [lookups])[0] for which in (DEFINITION, port)
+        )
     failed, explained, error, ulps = judge_values(value, reference, representation, lookups, "stress.ports")
     return {
         "where": lookups.where(index),
@@ -316,7 +361,7 @@ def show_case(key, name, evaluator, case, *, seed=0, storage=None):
         "w_view": lookups.w_view[index].tolist(),
         "lod": float(lookups.lod[index]),
         "definition": reference[index].tolist(),
-        evaluator: value[index].tolist(),
+        port: value[index].tolist(),
         "relative_error": float(error[index]),
         "ulps": float(ulps[index]),
         "explained_by_rounded_arguments": bool(explained[index]),

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
-def evaluator_table(findings):
+if TYPE_CHECKING:
+    from btfref.stress.judging import Finding
+
+
+def evaluator_table(findings: Sequence[Finding]) -> list[str]:
     """Method × evaluator: the worst error that rounded arguments do not explain, on which data, and the bound.
 
     Parameters
@@ -27,7 +33,8 @@ def evaluator_table(findings):
                 cells.append("–")
                 continue
             worst = max(mine, key=lambda f: (f.failures > 0, f.worst))
-            ulps = max((f.detail["ulps"].get("p99", 0) for f in mine if f.data == "bumpy"), default=0)
+            own_ulps = (f.detail["ulps"] for f in mine if f.detail and f.data == "bumpy")
+            ulps = max((found.get("p99", 0) for found in own_ulps), default=0)
             cells.append(f"{worst.worst:.1e} ({worst.data}); p99 {ulps:.0f} ulp")
         rows.append(
             [
@@ -42,7 +49,7 @@ def evaluator_table(findings):
     return _markdown(rows)
 
 
-def check_table(findings):
+def check_table(findings: Sequence[Finding]) -> list[str]:
     """Method × check of definitions and fits: the worst figure, where, and its bound.
 
     Parameters
@@ -75,7 +82,7 @@ def check_table(findings):
     return _markdown(rows)
 
 
-def failure_lines(findings):
+def failure_lines(findings: Sequence[Finding]) -> Iterator[str]:
     """One line a failed finding, with the command that shows it."""
     for f in findings:
         if not f.passed:
@@ -84,5 +91,5 @@ def failure_lines(findings):
             yield f"{text}{'; ' + f.where if f.where else ''}{'; ' + f.reproducer if f.reproducer else ''}"
 
 
-def _markdown(rows):
+def _markdown(rows: Sequence[Sequence[str]]) -> list[str]:
     return ["| " + " | ".join(row) + " |" for row in rows]

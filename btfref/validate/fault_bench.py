@@ -13,12 +13,14 @@ from btfref.comparison.waterfall import Picture, waterfall
 from btfref.conventions import PixelClass
 from btfref.gates.verdicts import Measured, judge
 from btfref.images.display import fit_display
-from btfref.representations.protocol import max_lod
 from btfref.scene.shipped import scene_file
+from btfref.stress.data import bumpy
+from btfref.stress.evaluators import evaluator
+from btfref.stress.judging import port_agreement
+from btfref.stress.lookups import USUAL, hard_lookups, hemisphere
 from btfref.validate.cell import ENVIRONMENT_GATES, GATES
-from btfref.validate.evaluators import sampling_gates
+from btfref.validate.method_gates import sampling_gates
 from btfref.validate.own_renderer import EIGHT_BIT, NOISY
-from btfref.validate.probes import hemisphere, probe_points
 
 #: The picture of the faults of the host: a curved surface seen from both sides, and more than one light.
 SCENE, LIGHTS = "cloth", "directional3"
@@ -63,13 +65,7 @@ class Bench:
     @cached_property
     def btf(self):
         """The material: a formula with bumps, 16² texels and 81² directions."""
-        from btfref.numerics.sphere.directions import directions
-        from btfref.sampling import SampledBTF
-        from btfref.stress.data import bumpy_values
-
-        views = directions("ubo81")
-        values = bumpy_values((16, 16), views, views).astype(np.float16)
-        return SampledBTF(values, views, views, attributes={"mesostructure": "formula"})
+        return bumpy(shape=(16, 16))
 
     def fit(self, subject):
         """The representation and its file."""
@@ -163,15 +159,11 @@ class Bench:
 
     def probes(self, subject):
         """The shader against the definition, at all levels of detail where there are any."""
-        from btfref.rendering.gl.probe import probe
-
         representation, _ = self.fit(subject)
-        rng = np.random.default_rng(11)
-        points = probe_points(rng, 4000, self.btf.views, self.btf.lights)
-        lod = rng.uniform(0, max_lod(representation), len(points[0])).astype(np.float32)
-        value = probe(representation, *points, lod)
+        lookups = hard_lookups(np.random.default_rng(11), representation, 4000, USUAL)
+        value = evaluator("glsl", representation).evaluate(*lookups.points, lod=lookups.lod)
         return [
-            *agreement(value, representation.evaluate(*points, lod=lod)).gates,
+            *port_agreement(value, representation, lookups.points, lookups.lod).gates,
             *judge("probe.finite", {"nonfinite": int(np.count_nonzero(~np.isfinite(value)))}),
         ]
 
@@ -208,14 +200,13 @@ class Bench:
 
     def overflow(self, subject, change=""):
         """Maps as halves on their way to the shader; the fault scales them beyond 65504 and lets it happen."""
-        from btfref.rendering.gl.probe import probe
-
         representation, _ = self.fit(subject)
         if change:
             name = max(representation.maps, key=lambda n: representation.maps[n].size)
             with np.errstate(over="ignore"):
                 large = (representation.maps[name].astype(np.float32) * 1e6).astype(np.float16)
             representation = dataclasses.replace(representation, maps={**representation.maps, name: large})
-        points = probe_points(np.random.default_rng(13), 2000, self.btf.views, self.btf.lights)
-        bad = int(np.count_nonzero(~np.isfinite(probe(representation, *points))))
+        lookups = hard_lookups(np.random.default_rng(13), representation, 2000, USUAL)
+        value = evaluator("glsl", representation).evaluate(*lookups.points)
+        bad = int(np.count_nonzero(~np.isfinite(value)))
         return judge("probe.finite", {"nonfinite": Measured(bad)})

@@ -240,7 +240,7 @@ def _checks(cache, spec, file, settings):
     """Agreement of the evaluators, sampling, and held-out directions of a method; cached."""
     from btfref.registry import method
     from btfref.representations.file.container import read_info
-    from btfref.validate.evaluators import probe_gates, sampling_gates
+    from btfref.validate.method_gates import probe_gates, sampling_gates
 
     key = key_of(
         {

@@ -3,46 +3,35 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from contextlib import chdir
+from types import ModuleType
+from typing import TYPE_CHECKING
 
-import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.gates.tolerances import tolerance
+from btfref.stress.evaluators import surface
+
+if TYPE_CHECKING:
+    from btfref.types import JitArray
 
 #: Cells of the test's table are integrated with this many intervals a side: densities jump at the borders of their own
 #: cells. With 16, four million samples of a sharp material (`svd` of the rings) tell the integral from the density.
 INTERVALS = 64
 
 
-def surface(mi, n, uv, w_view):
-    """Surface interactions in their own frame.
-
-    Parameters
-    ----------
-    mi : module
-        Mitsuba with a JIT variant.
-    n : int
-        How many.
-    uv : array_like, shape (2,) or (2, n)
-    w_view : array_like, shape (3,) or (3, n)
-
-    Returns
-    -------
-    mitsuba.SurfaceInteraction3f
-    """
-    import drjit as dr
-
-    def column(values):
-        # A single place is data, not code: one kernel serves all.
-        return dr.opaque(mi.Float, float(values)) if np.ndim(values) == 0 else mi.Float(np.asarray(values))
-
-    si = dr.zeros(mi.SurfaceInteraction3f, n)
-    si.uv = mi.Point2f(*map(column, uv))
-    si.wi = mi.Vector3f(*map(column, w_view))
-    return si
-
-
-def chi_square(mi, bsdf, uv, w_view, *, samples, tests=1, pdf_view=None, counts=None):
+def chi_square(
+    mi: ModuleType,
+    bsdf: JitArray,
+    uv: ArrayLike,
+    w_view: ArrayLike,
+    *,
+    samples: int,
+    tests: int = 1,
+    pdf_view: ArrayLike | None = None,
+    counts: Callable[[JitArray, JitArray, JitArray], JitArray] | None = None,
+) -> tuple[bool, str]:
     """Whether the directions that a BSDF samples follow its density.
 
     Parameters
@@ -69,7 +58,7 @@ def chi_square(mi, bsdf, uv, w_view, *, samples, tests=1, pdf_view=None, counts=
 
     context = mi.BSDFContext()
 
-    def sample(s):
+    def sample(s: JitArray) -> tuple[JitArray, JitArray]:
         si = surface(mi, dr.width(s), uv, w_view)
         bs, weight = bsdf.sample(context, si, s[0], mi.Point2f(s[1], s[2]))
         right = bs.pdf > 0
@@ -77,7 +66,7 @@ def chi_square(mi, bsdf, uv, w_view, *, samples, tests=1, pdf_view=None, counts=
             right &= counts(si, bs, weight)
         return bs.wo, dr.select(right, mi.Float(1), 0)
 
-    def pdf(w):
+    def pdf(w: JitArray) -> JitArray:
         return bsdf.pdf(context, surface(mi, dr.width(w), uv, w_view if pdf_view is None else pdf_view), w)
 
     test = mi.chi2.ChiSquareTest(

@@ -146,9 +146,9 @@ def used_gates():
     -------
     set of str
     """
-    from btfref.validate import cell, evaluators, own_renderer
+    from btfref.validate import cell, method_gates, own_renderer
 
-    keys = {"image.finite", "waterfall.closure", "environment.agreement", *cell.GATES, *evaluators.GATES}
+    keys = {"image.finite", "waterfall.closure", "environment.agreement", *cell.GATES, *method_gates.GATES}
     keys.update(*cell.ENVIRONMENT_GATES.values())
     return keys.union(own_renderer.LINEAR, own_renderer.EIGHT_BIT, own_renderer.NOISY)
 

@@ -1,14 +1,16 @@
-"""Three evaluators, one truth: Dr.Jit and GLSL against the float64 definition, for every registered method."""
+"""One truth: every port of the table of evaluators against the float64 definition, for every registered method."""
 
 import dataclasses
 
 import numpy as np
 import pytest
-from probes import hit_allowance, probe_points
+from probes import probe_points
 
 from btfref.comparison.comparison import agreement
 from btfref.conventions import FILTER_TYPES
 from btfref.registry import methods
+from btfref.stress.evaluators import EVALUATORS, PORTS
+from btfref.stress.judging import port_agreement
 
 N_PROBES = 24_000
 SETS = ("ubo81", "scattered")
@@ -31,84 +33,47 @@ def case(request, fits):
     key, kind, filter_type = request.param
     path = fits.path(key, kind)
     representation = with_filter(fits(key, kind), filter_type)
-    btf = fits.btf(kind)
-    uv, w_light, w_view = probe_points(np.random.default_rng(7), N_PROBES, btf.views, btf.lights)
+    uv, w_light, w_view = probe_points(np.random.default_rng(7), N_PROBES, representation)
     if filter_type == "nearest":
         uv = off_texel_edges(uv, representation.meta["texels"])
     return representation, path, filter_type, (uv, w_light, w_view)
 
 
 def assert_agrees(value, representation, points):
-    reference = representation.evaluate(*points)
-    allowance = hit_allowance(representation, value, reference, points)
-    for gate in agreement(value, reference, allowance=allowance).gates:
+    for gate in port_agreement(value, representation, points).gates:
         assert gate.passed, gate.line
 
 
-def test_drjit_agrees(case, llvm):
-    import drjit as dr
-
-    import mitsuba_plugins
-
+@pytest.mark.parametrize("port", PORTS)
+def test_every_port_agrees(case, port, evaluator):
     representation, path, filter_type, points = case
-    mi = llvm
-    mitsuba_plugins.register()
-    bsdf = mi.load_dict({"type": "btf", "filename": str(path), "filter_type": filter_type})
-    uv, w_light, w_view = points
-    si = dr.zeros(mi.SurfaceInteraction3f, len(uv))
-    si.uv, si.wi = mi.Point2f(uv.T), mi.Vector3f(w_view.T)
-    value = np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(w_light.T))).T
+    value = evaluator(port, representation, path, filter_type=filter_type).evaluate(*points)
     assert_agrees(value, representation, points)
-
-
-def test_glsl_agrees(case, need):
-    need("gl")
-    from btfref.rendering.gl.probe import probe
-
-    representation, _, _, points = case
-    assert_agrees(probe(representation, *points), representation, points)
 
 
 @pytest.mark.parametrize("key", methods())
 def test_swapped_directions_are_caught(key, fits):
     """A BTF is not reciprocal: an evaluator that swaps light and view must not pass."""
-    representation, btf = fits(key), fits.btf()
-    uv, w_light, w_view = probe_points(np.random.default_rng(7), 2000, btf.views, btf.lights)
+    representation = fits(key)
+    uv, w_light, w_view = probe_points(np.random.default_rng(7), 2000, representation)
     swapped = representation.evaluate(uv, w_view, w_light)
     assert not agreement(swapped, representation.evaluate(uv, w_light, w_view)).passed
 
 
 @pytest.mark.parametrize("key", methods())
-def test_invalid_lookups_are_zero_everywhere(key, fits, llvm, need):
+def test_invalid_lookups_are_zero_everywhere(key, fits, evaluator):
     """Below the horizon, NaN, infinite: exactly 0 in all evaluators; non-finite uv count as 0."""
-    import drjit as dr
-
-    import mitsuba_plugins
-    from btfref.rendering.gl.probe import probe
-
-    need("gl")
-    mi = llvm
-    mitsuba_plugins.register()
-    representation, path = fits(key), fits.path(key)
+    representation = fits(key)
+    subjects = [evaluator(name, representation, fits.path(key)) for name in EVALUATORS]
     up, nan, inf = [0, 0, 1], [np.nan, 0, 1], [0, 0, np.inf]
     down, flat = [0.6, 0, -0.8], [1, 0, 0]
     pairs = [(down, up), (up, down), (flat, up), (up, flat), (nan, up), (up, nan), (inf, up), (up, inf)]
     w_light, w_view = (np.array([p[i] for p in pairs], np.float32) for i in (0, 1))
     uv = np.full((len(pairs), 2), 0.3, np.float32)
-    si = dr.zeros(mi.SurfaceInteraction3f, len(uv))
-    si.uv, si.wi = mi.Point2f(uv.T), mi.Vector3f(w_view.T)
-    bsdf = mi.load_dict({"type": "btf", "filename": str(path)})
-    for fast in (True, False):
-        with dr.scoped_set_flag(dr.JitFlag.FastMath, fast):
-            value = np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(w_light.T)))
-            np.testing.assert_array_equal(value, 0)
-    np.testing.assert_array_equal(representation.evaluate(uv, w_light, w_view), 0)
-    np.testing.assert_array_equal(probe(representation, uv, w_light, w_view), 0)
+    for subject in subjects:
+        np.testing.assert_array_equal(subject.evaluate(uv, w_light, w_view), 0)
 
     uv = np.array([[np.nan, 0.2], [np.inf, 0.2], [-np.inf, np.nan], [1e6, -1e6], [3e38, 0]], np.float32)
     up = np.broadcast_to(np.float32(up), (len(uv), 3))
-    si = dr.zeros(mi.SurfaceInteraction3f, len(uv))
-    si.uv, si.wi = mi.Point2f(uv.T), mi.Vector3f(up.T)
-    value = np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(up.T))).T
-    assert_agrees(value, representation, (uv, up, up))
-    assert_agrees(probe(representation, uv, up, up), representation, (uv, up, up))
+    for subject in subjects:
+        assert_agrees(subject.evaluate(uv, up, up), representation, (uv, up, up))

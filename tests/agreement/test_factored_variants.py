@@ -1,13 +1,14 @@
-"""Every form and storage of the factored methods: Dr.Jit and GLSL against the float64 definition."""
+"""Every form and storage of the factored methods: all ports against the float64 definition."""
 
 import numpy as np
 import pytest
 from oracle import oracle_btf
 from probes import probe_points
 
-from btfref.comparison.comparison import agreement
 from btfref.registry import methods
 from btfref.representations import save
+from btfref.stress.evaluators import PORTS
+from btfref.stress.judging import port_agreement
 
 FORMS = {
     "cmf-float": ("cmf", {"storage": "float"}),
@@ -23,24 +24,11 @@ FORMS = {
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_every_form_agrees(form, llvm, need, tmp_path):
-    import drjit as dr
-
-    import mitsuba_plugins
-    from btfref.rendering.gl.probe import probe
-
-    need("gl")
+def test_every_form_agrees(form, evaluator, tmp_path):
     key, parameters = FORMS[form]
-    btf = oracle_btf((7, 6))
-    representation = methods()[key].fit(btf, map_size=16, clusters=10, **parameters)
-    points = probe_points(np.random.default_rng(5), 6000, btf.views, btf.lights)
-    expected = representation.evaluate(*points)
-    assert agreement(probe(representation, *points), expected).passed
+    representation = methods()[key].fit(oracle_btf((7, 6)), map_size=16, clusters=10, **parameters)
+    points = probe_points(np.random.default_rng(5), 6000, representation)
     save(representation, tmp_path / "a.exr")
-    mitsuba_plugins.register()
-    bsdf = llvm.load_dict({"type": "btf", "filename": str(tmp_path / "a.exr")})
-    uv, w_light, w_view = points
-    si = dr.zeros(llvm.SurfaceInteraction3f, len(uv))
-    si.uv, si.wi = llvm.Point2f(uv.T), llvm.Vector3f(w_view.T)
-    value = np.array(bsdf.eval(llvm.BSDFContext(), si, llvm.Vector3f(w_light.T))).T
-    assert agreement(value, expected).passed
+    for port in PORTS:
+        value = evaluator(port, representation, tmp_path / "a.exr").evaluate(*points)
+        assert port_agreement(value, representation, points).passed

@@ -4,14 +4,12 @@ import subprocess
 
 import numpy as np
 import pytest
-from oracle import KINDS
-from probes import hit_allowance
+from probes import probe_points
 
-from btfref.comparison import agreement
-from btfref.numerics.sphere.directions import directions
 from btfref.registry import methods
 from btfref.rendering.gl import composer, device
-from btfref.rendering.gl.probe import broadcast_points, probe
+from btfref.rendering.gl.probe import probe
+from btfref.stress.judging import port_agreement
 
 #: Sets of directions: test_evaluators.py has the others.
 SETS = ("shifted", "triangles")
@@ -19,49 +17,13 @@ SETS = ("shifted", "triangles")
 N_POINTS = 20_000
 
 
-def points(rng, views, lights, n=N_POINTS):
-    """Ordinary and awkward (uv, w_light, w_view), rounded to float32: what both evaluators are given."""
-
-    def around(spec):
-        samples = directions(spec).vectors
-        z = rng.uniform(0, 1, n)
-        phi = rng.uniform(-np.pi, np.pi, n)
-        kind = rng.integers(0, 8, n)
-        z = np.where(kind == 0, 10 ** rng.uniform(-8, -2, n), z)  # grazing
-        z = np.where(kind == 1, 1 - 10 ** rng.uniform(-7, -2, n), z)  # about the pole
-        r = np.sqrt(1 - z * z)
-        w = np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
-        exact = samples[rng.integers(0, len(samples), n)]
-        w = np.where((kind == 2)[:, None], exact, w)
-        # Beside a sample, by about float32's rounding and more.
-        beside = exact + rng.normal(size=(n, 3)) * 10 ** rng.uniform(-8, -3, (n, 1))
-        w = np.where((kind == 3)[:, None], beside, w)
-        # The seam of the azimuth, where phi jumps from +pi to -pi, and its other end at phi = 0.
-        w[:, 1] *= np.where(kind == 4, 1e-7, 1)
-        w[:, 2] = np.maximum(w[:, 2], 1e-9)
-        return w / np.linalg.norm(w, axis=1, keepdims=True)
-
-    uv = rng.uniform(-3, 3, (n, 2))
-    kind = rng.integers(0, 6, n)[:, None]
-    uv = np.where(kind == 0, rng.integers(-24, 24, (n, 2)) / 24, uv)  # centres and borders of texels
-    uv = np.where(kind == 1, rng.uniform(-300, 300, (n, 2)), uv)
-    return broadcast_points(uv, around(lights), around(views))[0][:, :8]
-
-
-def split(rows):
-    return rows[:, 0:2], rows[:, 2:5], rows[:, 5:8]
-
-
 @pytest.mark.parametrize("kind", SETS)
 @pytest.mark.parametrize("key", methods())
 def test_probe_agrees_with_the_definition(need, rng, fits, key, kind):
     need("gl")
     rep = fits(key, kind)
-    uv, w_light, w_view = split(points(rng, *KINDS[kind]))
-    definition = rep.evaluate(uv, w_light, w_view)
-    value = probe(rep, uv, w_light, w_view)
-    allowance = hit_allowance(rep, value, definition, (uv, w_light, w_view))
-    for result in agreement(value, definition, allowance=allowance).gates:
+    points = probe_points(rng, N_POINTS, rep)
+    for result in port_agreement(probe(rep, *points), rep, points).gates:
         assert result.passed, result.line
 
 
@@ -101,9 +63,8 @@ def test_a_lost_piece_fails_the_probe(need, rng, fits, tmp_path, monkeypatch):
     rep = fits("raw")
     shader, _ = device.shader_file(rep)
     monkeypatch.setattr(device, "shader_file", lambda rep: (shader, [tmp_path]))
-    uv, w_light, w_view = split(points(rng, *KINDS["ubo81"]))
-    found = agreement(probe(rep, uv, w_light, w_view), rep.evaluate(uv, w_light, w_view))
-    assert not found.passed
+    points = probe_points(rng, N_POINTS, rep)
+    assert not port_agreement(probe(rep, *points), rep, points).passed
 
 
 STAGES = [

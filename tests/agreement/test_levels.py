@@ -16,6 +16,8 @@ from btfref.representations.laplacian import definition as laplacian
 from btfref.scene.description import read_scene
 from btfref.scene.pixel_classes import pixel_classes
 from btfref.scene.shipped import scene_file
+from btfref.stress.evaluators import PORTS, surface
+from btfref.stress.judging import port_agreement
 
 LODS = (0.0, 0.37, 2.5, 4.0)
 SETTINGS = {
@@ -46,8 +48,8 @@ def gate_of(name):
     return "probe.agreement" if name == "default" else "lod.agreement"
 
 
-def points(btf, *, paper):
-    uv, w_light, w_view = probe_points(np.random.default_rng(5), 12_000, btf.views, btf.lights)
+def points(btf, representation, *, paper=False):
+    uv, w_light, w_view = probe_points(np.random.default_rng(5), 12_000, representation)
     if not paper:
         return uv, w_light, w_view
     # Nearest texels and directions jump: keep away from where rounding decides.
@@ -59,66 +61,46 @@ def points(btf, *, paper):
     return uv[clear], w_light[clear], w_view[clear]
 
 
-def interaction(mi, uv, w_view):
-    import drjit as dr
-
-    si = dr.zeros(mi.SurfaceInteraction3f, len(uv))
-    si.uv, si.wi = mi.Point2f(np.asarray(uv).T), mi.Vector3f(np.asarray(w_view).T)
-    return si
-
-
-def plugin(mi, path, **parameters):
-    import mitsuba_plugins
-
-    mitsuba_plugins.register()
-    return mi.load_dict({"type": "btf", "filename": str(path), **parameters})
-
-
 @pytest.mark.parametrize("lod", LODS)
 @pytest.mark.parametrize("name", SETTINGS)
-def test_all_evaluators_agree_at_any_level(made, fits, llvm, need, name, lod):
-    from btfref.rendering.gl.probe import probe
-
-    need("gl")
-    mi = llvm
+def test_all_evaluators_agree_at_any_level(made, fits, evaluator, name, lod):
     representation, path = made(name)
-    uv, w_light, w_view = points(fits.btf(), paper=name == "paper")
-    expected = representation.evaluate(uv, w_light, w_view, lod=lod)
-    bsdf = plugin(mi, path, lod="none", lod_bias=lod)
-    value = np.array(bsdf.eval(mi.BSDFContext(), interaction(mi, uv, w_view), mi.Vector3f(w_light.T))).T
-    for found in (value, probe(representation, uv, w_light, w_view, lod)):
-        for gate in agreement(found, expected, gate=gate_of(name)).gates:
+    looked = points(fits.btf(), representation, paper=name == "paper")
+    # The plugin's own parameter, and a level of each lookup: the same.
+    values = [evaluator("drjit", representation, path, lod="none", lod_bias=lod).evaluate(*looked)]
+    values += [evaluator(port, representation, path).evaluate(*looked, lod=lod) for port in PORTS]
+    for value in values:
+        for gate in port_agreement(value, representation, looked, lod, gate=gate_of(name)).gates:
             assert gate.passed, gate.line
     if lod:
-        assert not agreement(representation.evaluate(uv, w_light, w_view), expected).passed
+        assert not port_agreement(representation.evaluate(*looked), representation, looked, lod).passed
 
 
-def test_each_lookup_has_its_own_level(made, fits, need, rng):
-    from btfref.rendering.gl.probe import probe
-
-    need("gl")
-    representation, _ = made("default")
-    uv, w_light, w_view = points(fits.btf(), paper=False)
-    lod = np.where(rng.random(len(uv)) < 0.3, rng.integers(0, 5, len(uv)), rng.uniform(-1, 6, len(uv)))
-    lod = lod.astype(np.float32)
-    expected = representation.evaluate(uv, w_light, w_view, lod=lod)
-    for gate in agreement(probe(representation, uv, w_light, w_view, lod), expected).gates:
-        assert gate.passed, gate.line
+def test_each_lookup_has_its_own_level(made, fits, evaluator, rng):
+    representation, path = made("default")
+    looked = points(fits.btf(), representation)
+    n = len(looked[0])
+    lod = np.where(rng.random(n) < 0.3, rng.integers(0, 5, n), rng.uniform(-1, 6, n)).astype(np.float32)
+    for port in PORTS:
+        value = evaluator(port, representation, path).evaluate(*looked, lod=lod)
+        for gate in port_agreement(value, representation, looked, lod).gates:
+            assert gate.passed, gate.line
 
 
-def test_other_methods_ignore_the_level(fits, llvm):
-    mi = llvm
-    uv, w_light, w_view = points(fits.btf(), paper=False)
+def test_other_methods_ignore_the_level(fits, evaluator):
+    import mitsuba as mi
+
     for key in ("lpca", "rf_poly"):
-        values = [
-            np.array(b.eval(mi.BSDFContext(), interaction(mi, uv, w_view), mi.Vector3f(w_light.T)))
-            for b in (plugin(mi, fits.path(key)), plugin(mi, fits.path(key), lod="none", lod_bias=2.0))
+        looked = points(fits.btf(), fits(key))
+        subjects = [
+            evaluator("drjit", fits(key), fits.path(key), **more)
+            for more in ({}, {"lod": "none", "lod_bias": 2.0})
         ]
-        np.testing.assert_array_equal(*values)
-        assert not [n for n, _ in mi.traverse(plugin(mi, fits.path(key))) if "pixel_angle" in n]
+        np.testing.assert_array_equal(*(subject.evaluate(*looked) for subject in subjects))
+        assert not [n for n, _ in mi.traverse(subjects[0].plugin) if "pixel_angle" in n]
 
 
-def test_the_plugin_averages_along_the_footprint(made, fits, llvm, rng):
+def test_the_plugin_averages_along_the_footprint(made, fits, llvm, load_plugin, rng):
     """Against the definition, lookup by lookup, on slanted planes with sheared texture coordinates."""
     import drjit as dr
 
@@ -134,13 +116,13 @@ def test_the_plugin_averages_along_the_footprint(made, fits, llvm, rng):
     w_view[:, 2] = 0.05 + np.abs(w_view[:, 2])
     w_view /= np.linalg.norm(w_view, axis=1, keepdims=True)
     distance, uv = 10 ** rng.uniform(-0.5, 1.5, n), rng.random((n, 2))
-    si = interaction(mi, uv, w_view)
+    si = surface(mi, n, uv.T, w_view.T)
     si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
     frame = [np.array(v).T for v in (si.sh_frame.s, si.sh_frame.t)]
     si.dp_du, si.dp_dv = mi.Vector3f(dp_du.T), mi.Vector3f(dp_dv.T)
     si.t = mi.Float(distance)
     light = np.array([0.3, -0.2, 0.9]) / np.linalg.norm([0.3, -0.2, 0.9])
-    bsdf = plugin(mi, path, to_uv=to_uv, pixel_angle=angle)
+    bsdf = load_plugin(path, to_uv=to_uv, pixel_angle=angle)
     found = np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(light))).T
 
     world = w_view[:, :1] * frame[0] + w_view[:, 1:2] * frame[1] + w_view[:, 2:] * [0, 0, 1]
@@ -172,13 +154,13 @@ def test_the_plugin_averages_along_the_footprint(made, fits, llvm, rng):
     # Texture derivatives, where an integrator gives them, come first: a head-on square of w texels.
     w = 6.0
     si.duv_dx, si.duv_dy = mi.Vector2f(w / columns, 0), mi.Vector2f(0, w / rows)
-    plain = plugin(mi, path, pixel_angle=angle)
+    plain = load_plugin(path, pixel_angle=angle)
     found = np.array(plain.eval(mi.BSDFContext(), si, mi.Vector3f(light))).T
     expected = representation.evaluate(uv, light, w_view, lod=0.5 * np.log2(1 + w * w / 5))
     for gate in agreement(found, expected, gate="lod.footprint").gates:
         assert gate.passed, gate.line
     # Distance alone, as in the paper; the camera's place goes before the ray's length.
-    far = plugin(mi, path, lod="distance", lod_unit=2.0, camera=mi.ScalarPoint3f(0, 0, 8))
+    far = load_plugin(path, lod="distance", lod_unit=2.0, camera=mi.ScalarPoint3f(0, 0, 8))
     found = np.array(far.eval(mi.BSDFContext(), si, mi.Vector3f(light))).T
     for gate in agreement(found, representation.evaluate(uv, light, w_view, lod=2.0)).gates:
         assert gate.passed, gate.line
@@ -237,7 +219,7 @@ def test_far_surfaces_fetch_less(made, need):
     assert fetches[1] <= 12 + 16
 
 
-def test_bad_levels_name_the_field(made, llvm):
+def test_bad_levels_name_the_field(made, load_plugin):
     from btfref.errors import InputError
 
     _, path = made("default")
@@ -248,6 +230,6 @@ def test_bad_levels_name_the_field(made, llvm):
         ({"pixel_angle": -1.0}, "pixel_angle"),
     ):
         with pytest.raises(RuntimeError, match=f"field '{field}'"):
-            plugin(llvm, path, **parameters)
+            load_plugin(path, **parameters)
     with pytest.raises(InputError, match="level of detail"):
         read_scene(scene_file("horizon"), {"btf": str(path), "lod": "best"})

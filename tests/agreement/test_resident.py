@@ -45,21 +45,19 @@ def lookups(rng, representation, kind, chosen, n=4000):
 
 @pytest.mark.parametrize("directions", ["ubo81", "triangles"])
 @pytest.mark.parametrize(("key", "kind"), CASES)
-def test_kept_directions_give_the_same_numbers_and_others_none(need, fits, llvm, rng, key, kind, directions):
-    import drjit as dr
-
-    import mitsuba_plugins
-
+def test_kept_directions_give_the_same_numbers_and_others_none(
+    need, fits, evaluator, rng, key, kind, directions
+):
     need("gl")
     whole, path = fits(key, directions), fits.path(key, directions)
     total = whole.meta[f"{kind}s"]["count"]
-    kept = 2 * total // 3
-    chosen = np.sort(rng.choice(total, kept, replace=False))
+    count = 2 * total // 3
+    chosen = np.sort(rng.choice(total, count, replace=False))
     some = load(path, **{f"{kind}s": chosen})
     for pattern, axis in direction_axes(whole, kind).items():
         names = fnmatch.filter(some.maps, pattern)
         assert names or pattern == "mean"
-        assert all(some.maps[name].shape[axis] == kept for name in names)
+        assert all(some.maps[name].shape[axis] == count for name in names)
     points, enough = lookups(rng, whole, kind, chosen)
     assert MIXED < enough.mean() < 1 - MIXED
     inside, outside = (tuple(a[mask] for a in points) for mask in (enough, ~enough))
@@ -70,37 +68,22 @@ def test_kept_directions_give_the_same_numbers_and_others_none(need, fits, llvm,
     np.testing.assert_array_equal(probe(some, *inside), probe(whole, *inside))
     assert np.isnan(probe(some, *outside)).all()
 
-    mitsuba_plugins.register()
-    names = " ".join(map(str, chosen))
-    parts = [
-        llvm.load_dict({"type": "btf", "filename": str(path), **more}) for more in ({}, {f"{kind}s": names})
+    values = [
+        evaluator("drjit", whole, path, **kept(more)).evaluate(*points) for more in ({}, {f"{kind}s": chosen})
     ]
-    si = dr.zeros(llvm.SurfaceInteraction3f, len(points[0]))
-    si.uv, si.wi = llvm.Point2f(points[0].T), llvm.Vector3f(points[2].T)
-    values = [np.array(p.eval(llvm.BSDFContext(), si, llvm.Vector3f(points[1].T))).T for p in parts]
     np.testing.assert_array_equal(values[1][enough], values[0][enough])
     assert np.isnan(values[1][~enough]).all()
 
 
-def values_of(llvm, path, points, lod=None, **more):
-    """B by the plugin, float32 (N, 3)."""
-    import drjit as dr
-
-    import mitsuba_plugins
-
-    mitsuba_plugins.register()
-    text = {name: " ".join(map(str, indices)) for name, indices in more.items()}
-    level = {} if lod is None else {"lod": "none", "lod_bias": lod}
-    plugin = llvm.load_dict({"type": "btf", "filename": str(path), **text, **level})
-    si = dr.zeros(llvm.SurfaceInteraction3f, len(points[0]))
-    si.uv, si.wi = llvm.Point2f(points[0].T), llvm.Vector3f(points[2].T)
-    return np.array(plugin.eval(llvm.BSDFContext(), si, llvm.Vector3f(points[1].T))).T
+def kept(chosen):
+    """The plugin's parameters for indices of what is kept, by name."""
+    return {name: " ".join(map(str, indices)) for name, indices in chosen.items()}
 
 
 @pytest.mark.parametrize("filter_type", ["bilinear", "nearest"])
 @pytest.mark.parametrize("key", ["lpca", "gbrdf"])
 def test_kept_entries_give_the_same_numbers_and_others_none(
-    need, fits, llvm, rng, tmp_path, key, filter_type
+    need, fits, evaluator, rng, tmp_path, key, filter_type
 ):
     need("gl")
     fitted = fits(key)
@@ -138,7 +121,10 @@ def test_kept_entries_give_the_same_numbers_and_others_none(
         some.evaluate(*(a[lit] for a in points))
     pairs = (
         (probe(some, *points), probe(whole, *points)),
-        (values_of(llvm, path, points, entries=chosen), values_of(llvm, path, points)),
+        [
+            evaluator("drjit", whole, path, **more).evaluate(*points)
+            for more in (kept({"entries": chosen}), {})
+        ],
     )
     for found, full in pairs:
         # Where a ray passes a silhouette, a port may see another texel than the definition.
@@ -158,12 +144,18 @@ def test_kept_entries_give_the_same_numbers_and_others_none(
         load(fits.path("svd"), entries=[0])
 
 
-def test_kept_levels_give_the_same_numbers_and_finer_ones_none(need, fits, llvm, rng):
+def test_kept_levels_give_the_same_numbers_and_finer_ones_none(need, fits, evaluator, rng):
     need("gl")
     whole, path = fits("laplacian"), fits.path("laplacian")
     total = len(whole.meta["levels"])
     points = rng.uniform(size=(500, 2)).astype(np.float32), hemisphere(rng, 500), hemisphere(rng, 500)
     for first in (1, total - 1):
+        levels = kept({"levels": np.arange(first, total)})
+
+        def ported(lod, **more):
+            level = {"lod": "none", "lod_bias": lod}
+            return evaluator("drjit", whole, path, **level, **more).evaluate(*points)
+
         some = load(path, levels=np.arange(first, total))
         assert not any(name in some.maps for name in ("basis_0", "weights_0"))
         assert some.port_arrays()["weights"].size < whole.port_arrays()["weights"].size
@@ -172,12 +164,11 @@ def test_kept_levels_give_the_same_numbers_and_finer_ones_none(need, fits, llvm,
                 lambda rep, lod: rep.evaluate(*points, lod=lod), lambda rep, lod: probe(rep, *points, lod)
             ):  # fmt: skip
                 np.testing.assert_array_equal(evaluate(some, lod), evaluate(whole, lod))
-            found = values_of(llvm, path, points, lod, levels=np.arange(first, total))
-            np.testing.assert_array_equal(found, values_of(llvm, path, points, lod))
+            np.testing.assert_array_equal(ported(lod, **levels), ported(lod))
         with pytest.raises(InputError, match="levels that are not resident"):
             some.evaluate(*points, lod=first - 0.1)
         assert np.isnan(probe(some, *points, first - 0.1)).all()
-        assert np.isnan(values_of(llvm, path, points, first - 0.1, levels=np.arange(first, total))).all()
+        assert np.isnan(ported(first - 0.1, **levels)).all()
         assert np.isfinite(some.sampling_tables()[1]).all()
     for levels, message in (([0], "from one on"), ([total], "no such levels"), ([], "no such levels")):
         with pytest.raises(InputError, match=message):

@@ -15,6 +15,7 @@ from btfref.rendering.offline.reference import render
 from btfref.representations import save
 from btfref.representations.factored import cmf
 from btfref.scene.pixel_classes import pixel_classes
+from btfref.stress.evaluators import EVALUATORS
 
 GRID, SIZE = 2, (64, 64)
 
@@ -40,25 +41,15 @@ def alternating(fitted):
 
 
 @pytest.mark.parametrize("storage", ["half", "byte"])
-def test_no_slice_leaks_into_another(storage, llvm, need, rng, tmp_path):
-    import drjit as dr
-
-    import mitsuba_plugins
-    from btfref.rendering.gl.probe import probe
-
-    need("gl")
+def test_no_slice_leaks_into_another(storage, evaluator, rng, tmp_path):
     fitted = alternating(fit(oracle_btf((6, 6)), clusters=8, storage=storage))
     assert len(fitted.maps["factor_p"]) == 8
     w, w_view = hemisphere(rng, 4000), hemisphere(rng, 4000)
     uv = rng.random((4000, 2)).astype(np.float32)
     expected = np.minimum(w[:, 2:] / fitted.meta["constants"]["light_cos_last"], 1) * np.ones(3)
     save(fitted, tmp_path / "a.exr")
-    mitsuba_plugins.register()
-    bsdf = llvm.load_dict({"type": "btf", "filename": str(tmp_path / "a.exr")})
-    si = dr.zeros(llvm.SurfaceInteraction3f, len(uv))
-    si.uv, si.wi = llvm.Point2f(uv.T), llvm.Vector3f(w_view.T)
-    port = np.array(bsdf.eval(llvm.BSDFContext(), si, llvm.Vector3f(w.T))).T
-    for value in (fitted.evaluate(uv, w, w_view), probe(fitted, uv, w, w_view), port):
+    for name in EVALUATORS:
+        value = evaluator(name, fitted, tmp_path / "a.exr").evaluate(uv, w, w_view)
         np.testing.assert_allclose(value, expected, atol=tolerance("probe.agreement.p999"))
 
 

@@ -16,7 +16,7 @@ from btfref.precision import computing_in
 from btfref.registry import method, methods
 from btfref.stress import properties, runner
 from btfref.stress.data import DATA, make, scattered
-from btfref.stress.evaluators import PORTS
+from btfref.stress.evaluators import MEASURED, Definition
 from btfref.stress.judging import judge_values
 from btfref.stress.lookups import COORDINATES, DIRECTIONS, block
 from btfref.stress.table import check_table, evaluator_table, failure_lines
@@ -177,15 +177,15 @@ def test_malformed_lookups_are_counted(fits):
 
 def test_every_port_counts_malformed_lookups(fits, llvm, need, monkeypatch):
     need("gl")
-    findings = list(runner.stress_lookups(fits("raw"), "formula", PORTS, n=1024))
+    findings = list(runner.stress_lookups(fits("raw"), "formula", MEASURED, n=1024))
     counted = [f for f in findings if f.check == "malformed counted"]
-    assert [f.evaluator for f in counted] == list(PORTS)
+    assert [f.evaluator for f in counted] == list(MEASURED)
     assert all(f.passed and f.detail["directions"] > 50 and f.detail["coordinates"] > 50 for f in counted)
     wrong = {"directions": 1, "coordinates": 1}
-    monkeypatch.setattr(runner, "count_malformed", lambda *_: wrong)
+    monkeypatch.setattr(Definition, "malformed", lambda *_: wrong)
     assert not [
         f
-        for f in runner.stress_lookups(fits("raw"), "formula", PORTS[:1], n=1024)
+        for f in runner.stress_lookups(fits("raw"), "formula", MEASURED[:1], n=1024)
         if f.check == "malformed counted" and f.passed
     ]
 

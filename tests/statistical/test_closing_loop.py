@@ -158,18 +158,14 @@ def test_direct_light_alone_is_caught(mesostructure, vectors, btf, plain):
 
 
 @pytest.mark.usefixtures("llvm")
-def test_raw_plugin_on_a_plane_equals_the_geometry(llvm, btf, plain, vectors, tmp_path):
+def test_raw_plugin_on_a_plane_equals_the_geometry(llvm, load_plugin, btf, plain, vectors, tmp_path):
     """The same camera on a flat rectangle with the raw BTF: the picture is the texels, and the geometry's."""
-    import mitsuba_plugins
     from btfref.representations.file.container import save
     from btfref.representations.tabulated import raw
 
     mi = llvm
-    mitsuba_plugins.register()
     save(raw.fit(btf), tmp_path / "checker.raw.exr")
-    material = mi.load_dict(
-        {"type": "btf", "filename": str(tmp_path / "checker.raw.exr"), "filter_type": "nearest"}
-    )
+    material = load_plugin(tmp_path / "checker.raw.exr", filter_type="nearest")
     place = mi.ScalarTransform4f().translate([0.5, 0.5, 0]).scale([0.5, 0.5, 1])
     integrator = mi.load_dict({"type": "direct", "bsdf_samples": 0, "emitter_samples": 1})
     pictures = np.zeros_like(btf.values)

@@ -7,10 +7,15 @@ from oracle import oracle_btf
 from btfref.gates.tolerances import tolerance
 from btfref.registry import methods
 from btfref.representations import save
-from btfref.validate.sampling import chi_square, surface
+from btfref.stress.evaluators import surface
+from btfref.stress.lookups import unit
+from btfref.validate.sampling import chi_square
 
 UVS = ((0.1, 0.2), (0.72, 0.35), (0.5, 0.5), (0.3, 0.8), (0.9, 0.93))
-VIEWS = {"normal": (0, 0, 1), "oblique": (0.6, 0.2, 0.7), "grazing": (0.9, -0.3, 0.02)}
+VIEWS = {
+    name: unit(np.array(w))
+    for name, w in {"normal": (0.0, 0, 1), "oblique": (0.6, 0.2, 0.7), "grazing": (0.9, -0.3, 0.02)}.items()
+}
 SAMPLES = 1_000_000
 
 #: Methods that propose directions by lobes or microfacets of their own: a test holds that these are all.
@@ -30,13 +35,6 @@ def case(request, fits):
     return fits.path(key, kind), {"sampling": sampling} if sampling else {}
 
 
-def load(mi, path, **parameters):
-    import mitsuba_plugins
-
-    mitsuba_plugins.register()
-    return mi.load_dict({"type": "btf", "filename": str(path), **parameters})
-
-
 def test_these_methods_have_lobes_of_their_own(llvm):
     from importlib import import_module
 
@@ -48,29 +46,25 @@ def test_these_methods_have_lobes_of_their_own(llvm):
     assert having == set(OWN)
 
 
-def unit(w):
-    return np.array(w, float) / np.linalg.norm(w)
-
-
-def assert_samples_follow_the_density(mi, case, view, uvs):
+def assert_samples_follow_the_density(mi, bsdf, view, uvs):
     """χ² of a million samples a place; significance Šidák-corrected over all that may be made."""
-    bsdf, n_tests = load(mi, case[0], **case[1]), len(VIEWS) * len(UVS) * len(CASES)
+    n_tests = len(VIEWS) * len(UVS) * len(CASES)
     for uv in uvs:
-        right, message = chi_square(mi, bsdf, uv, unit(VIEWS[view]), samples=SAMPLES, tests=n_tests)
+        right, message = chi_square(mi, bsdf, uv, VIEWS[view], samples=SAMPLES, tests=n_tests)
         assert right, message
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_samples_follow_the_density(case, view, llvm):
+def test_samples_follow_the_density(case, view, llvm, load_plugin):
     """At one place a view: each view of a method, and each method of a view, has another. All pairs: the long run."""
     turn = [c[0] for c in CASES].index(case[0].name.split(".")[1]) + list(VIEWS).index(view)
-    assert_samples_follow_the_density(llvm, case, view, [UVS[turn % len(UVS)]])
+    assert_samples_follow_the_density(llvm, load_plugin(case[0], **case[1]), view, [UVS[turn % len(UVS)]])
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("view", VIEWS)
-def test_samples_follow_the_density_everywhere(case, view, llvm):
-    assert_samples_follow_the_density(llvm, case, view, UVS)
+def test_samples_follow_the_density_everywhere(case, view, llvm, load_plugin):
+    assert_samples_follow_the_density(llvm, load_plugin(case[0], **case[1]), view, UVS)
 
 
 def grid(n_theta=192, n_phi=384):
@@ -92,22 +86,22 @@ def grid(n_theta=192, n_phi=384):
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_density_integrates_to_one(case, view, llvm):
+def test_density_integrates_to_one(case, view, llvm, load_plugin):
     mi = llvm
-    bsdf = load(mi, case[0], **case[1])
+    bsdf = load_plugin(case[0], **case[1])
     w, solid_angle = grid()
-    si = surface(mi, len(UVS) * len(w), np.repeat(UVS, len(w), 0).T, unit(VIEWS[view]))
+    si = surface(mi, len(UVS) * len(w), np.repeat(UVS, len(w), 0).T, VIEWS[view])
     pdf = np.array(bsdf.pdf(mi.BSDFContext(), si, mi.Vector3f(np.tile(w, (len(UVS), 1)).T)))
     integral = pdf.reshape(len(UVS), -1) @ solid_angle
     assert np.abs(integral - 1).max() <= tolerance("pdf.integral.max")
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_weight_is_value_over_density(case, view, llvm, rng):
+def test_weight_is_value_over_density(case, view, llvm, load_plugin, rng):
     """sample() returns eval/pdf and its own pdf(); eval_pdf() is the pair of both."""
     mi = llvm
-    bsdf, context, n = load(mi, case[0], **case[1]), mi.BSDFContext(), len(UVS) << 15
-    si = surface(mi, n, np.repeat(UVS, 1 << 15, 0).T, unit(VIEWS[view]))
+    bsdf, context, n = load_plugin(case[0], **case[1]), mi.BSDFContext(), len(UVS) << 15
+    si = surface(mi, n, np.repeat(UVS, 1 << 15, 0).T, VIEWS[view])
     bs, weight = bsdf.sample(context, si, mi.Float(rng.random(n)), mi.Point2f(rng.random((2, n))))
     value, pdf = bsdf.eval(context, si, bs.wo), np.array(bsdf.pdf(context, si, bs.wo))
     both = bsdf.eval_pdf(context, si, bs.wo)
@@ -128,17 +122,17 @@ N_VARIANCE_TEXELS = 96
 
 @pytest.mark.parametrize("case", [c for c in CASES if not c[2]], indirect=True, ids="-".join)
 @pytest.mark.parametrize("view", VIEWS)
-def test_variance_is_at_most_that_of_cosine_sampling(case, view, llvm):
+def test_variance_is_at_most_that_of_cosine_sampling(case, view, llvm, load_plugin):
     """Exact by quadrature, summed over texels: constant environment, bright spots where the material reflects most.
 
     Lobes alone, which are no method's default, are not held to it: Lafortune's are not.
     """
     mi = llvm
     context = mi.BSDFContext()
-    guided, cosine = load(mi, case[0]), load(mi, case[0], sampling="cosine")
+    guided, cosine = load_plugin(case[0]), load_plugin(case[0], sampling="cosine")
     w, solid_angle = grid(48, 128)
     uv = np.random.default_rng(11).random((N_VARIANCE_TEXELS, 2))
-    si = surface(mi, len(uv) * len(w), np.repeat(uv, len(w), 0).T, unit(VIEWS[view]))
+    si = surface(mi, len(uv) * len(w), np.repeat(uv, len(w), 0).T, VIEWS[view])
     w_light = mi.Vector3f(np.tile(w, (len(uv), 1)).T)
 
     def table(values):
@@ -157,7 +151,7 @@ def test_variance_is_at_most_that_of_cosine_sampling(case, view, llvm):
         assert variance[0].sum() / variance[1].sum() <= tolerance("sample.variance_ratio.max"), name
 
 
-def test_lambertian_is_sampled_as_by_cosine(llvm, tmp_path):
+def test_lambertian_is_sampled_as_by_cosine(llvm, load_plugin, tmp_path):
     """A constant B / cos θ leaves the cells equal: the densities are the same but for interpolation of the cosine."""
     from dataclasses import replace
 
@@ -165,29 +159,35 @@ def test_lambertian_is_sampled_as_by_cosine(llvm, tmp_path):
     btf = oracle_btf((4, 4))
     values = np.broadcast_to(btf.lights.vectors[None, :, None, None, 2:] / np.pi, btf.values.shape)
     save(methods()["raw"].fit(replace(btf, values=values.astype(np.float16))), tmp_path / "flat.raw.exr")
-    bsdf = load(mi, tmp_path / "flat.raw.exr")
+    bsdf = load_plugin(tmp_path / "flat.raw.exr")
     w, _ = grid(32, 64)
     pdf = np.array(
-        bsdf.pdf(mi.BSDFContext(), surface(mi, len(w), (0.4, 0.4), unit((0.3, 0.1, 0.9))), mi.Vector3f(w.T))
+        bsdf.pdf(
+            mi.BSDFContext(),
+            surface(mi, len(w), (0.4, 0.4), unit(np.array([0.3, 0.1, 0.9]))),
+            mi.Vector3f(w.T),
+        )
     )
     np.testing.assert_allclose(pdf, w[:, 2] / np.pi, rtol=tolerance("sample.lambert.max"))
 
 
-def test_a_wrong_density_is_caught(fits, llvm):
+def test_a_wrong_density_is_caught(fits, llvm, load_plugin):
     """The χ² test rejects samples of one view against the density of another."""
-    bsdf = load(llvm, fits.path("lpca"))
-    right, _ = chi_square(llvm, bsdf, UVS[0], (0, 0, 1), samples=SAMPLES, pdf_view=unit((0.3, 0, 1)))
+    bsdf = load_plugin(fits.path("lpca"))
+    right, _ = chi_square(
+        llvm, bsdf, UVS[0], (0, 0, 1), samples=SAMPLES, pdf_view=unit(np.array([0.3, 0, 1]))
+    )
     assert not right
 
 
 @pytest.mark.parametrize("lod", [0.5, 1.0, 2.3, 3.0, 4.0])
-def test_sampling_at_every_level_of_detail(fits, lod, llvm):
+def test_sampling_at_every_level_of_detail(fits, lod, llvm, load_plugin):
     """χ² with the density, weights that are value over density, and no more variance than cosine sampling."""
     import drjit as dr
 
     mi, path = llvm, fits.path("laplacian")
-    bsdf, context = load(mi, path, lod="none", lod_bias=lod), mi.BSDFContext()
-    w_view = unit(VIEWS["oblique"])
+    bsdf, context = load_plugin(path, lod="none", lod_bias=lod), mi.BSDFContext()
+    w_view = VIEWS["oblique"]
 
     def weighed(si, bs, weight):
         value = bsdf.eval(context, si, bs.wo)

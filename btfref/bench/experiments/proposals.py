@@ -47,20 +47,13 @@ def run(*, quick=False, progress=None, btf=None, only=None):
         radiance), times as in :func:`btfref.bench.timing.summary`, and ``inefficiency``: variance times time over that
         of the guide; ``raw``: seconds.
     """
-    from btfref.platform import prepare_llvm
-
-    prepare_llvm()
-    import mitsuba as mi
-
+    import mitsuba_plugins
     from btfref.bench.data import checker
     from btfref.registry import methods
     from btfref.representations import save
 
     btf = btf or checker(spp=8, progress=progress)
-    mi.set_variant("llvm_ad_rgb")
-    import mitsuba_plugins
-
-    mitsuba_plugins.register()
+    mi = mitsuba_plugins.ready()
     raw, result = {}, {}
     with tempfile.TemporaryDirectory() as folder:
         for key, row in methods().items():

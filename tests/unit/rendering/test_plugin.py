@@ -11,42 +11,21 @@ from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
 from btfref.registry import method, methods
 from btfref.representations import load, save
-
-
-@pytest.fixture(scope="module")
-def btf(fits):
-    return fits.btf()
-
-
-def bsdf(mi, path, **parameters):
-    import mitsuba_plugins
-
-    mitsuba_plugins.register()
-    return mi.load_dict({"type": "btf", "filename": str(path), **parameters})
-
-
-def interaction(mi, uv, w_view):
-    import drjit as dr
-
-    si = dr.zeros(mi.SurfaceInteraction3f, len(w_view))
-    si.uv, si.wi = mi.Point2f(np.asarray(uv).T), mi.Vector3f(np.asarray(w_view).T)
-    return si
+from btfref.stress.evaluators import surface
 
 
 def value(mi, plugin, uv, w_light, w_view, mode=None):
     context = mi.BSDFContext() if mode is None else mi.BSDFContext(mode)
-    return np.array(plugin.eval(context, interaction(mi, uv, w_view), mi.Vector3f(np.asarray(w_light).T))).T
+    si = surface(mi, len(uv), np.asarray(uv).T, np.asarray(w_view).T)
+    return np.array(plugin.eval(context, si, mi.Vector3f(np.asarray(w_light).T))).T
 
 
-def test_registers_again_after_a_variant_change(fits, llvm):
-    import mitsuba_plugins
-
-    mi = llvm
-    first = bsdf(mi, fits.path("lpca"))
-    mi.set_variant("scalar_rgb")
-    mi.set_variant("llvm_ad_rgb")
-    mitsuba_plugins.register()
-    second = bsdf(mi, fits.path("lpca"))
+def test_registers_again_after_a_variant_change(fits, llvm, load_plugin):
+    first = load_plugin(fits.path("lpca"))
+    # A variant that cannot take the plugin gives way to one that can.
+    llvm.set_variant("scalar_rgb")
+    second = load_plugin(fits.path("lpca"))
+    assert llvm.variant() == "llvm_ad_rgb"
     assert str(first) == str(second)
     assert "method=lpca" in str(second)
 
@@ -74,24 +53,24 @@ def test_other_variants_are_refused(variant, need):
         ({"sampling": "none"}, "sampling"),
     ],
 )
-def test_bad_parameters_name_the_field(fits, llvm, parameters, field):
+def test_bad_parameters_name_the_field(fits, llvm, load_plugin, parameters, field):
     with pytest.raises(RuntimeError, match=f"field '{field}'"):
-        bsdf(llvm, fits.path("raw"), **parameters)
+        load_plugin(fits.path("raw"), **parameters)
 
 
-def test_mirroring_transforms_are_refused(fits, llvm):
+def test_mirroring_transforms_are_refused(fits, llvm, load_plugin):
     with pytest.raises(RuntimeError, match="mirrors"):
-        bsdf(llvm, fits.path("raw"), to_uv=llvm.ScalarTransform4f().scale([-1, 1, 1]))
+        load_plugin(fits.path("raw"), to_uv=llvm.ScalarTransform4f().scale([-1, 1, 1]))
 
 
-def test_scale_and_transform(fits, llvm, btf, rng):
+def test_scale_and_transform(fits, llvm, load_plugin, rng):
     """``scale`` multiplies; ``to_uv`` moves the texture, and its rotation turns the local frame."""
     mi = llvm
     representation = load(fits.path("raw"))
-    uv, w_light, w_view = probe_points(rng, 2000, btf.views, btf.lights)
+    uv, w_light, w_view = probe_points(rng, 2000, representation)
     uv = np.mod(uv, 1).astype(np.float32)
     transform = mi.ScalarTransform4f().translate([0.3, 0.1, 0]).rotate([0, 0, 1], 30).scale([2, 2, 1])
-    got = value(mi, bsdf(mi, fits.path("raw"), scale=2.5, to_uv=transform), uv, w_light, w_view)
+    got = value(mi, load_plugin(fits.path("raw"), scale=2.5, to_uv=transform), uv, w_light, w_view)
     angle = np.radians(30)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
@@ -103,9 +82,9 @@ def test_scale_and_transform(fits, llvm, btf, rng):
     assert np.abs(got - expected).max() <= tolerance("plugin.transform.max") * scale
 
 
-def test_importance_transport_swaps_the_roles(fits, llvm, rng):
+def test_importance_transport_swaps_the_roles(fits, llvm, load_plugin, rng):
     mi = llvm
-    plugin = bsdf(mi, fits.path("lpca"))
+    plugin = load_plugin(fits.path("lpca"))
     a, b = hemisphere(rng, 500), hemisphere(rng, 500)
     uv = rng.random((500, 2))
     radiance = value(mi, plugin, uv, a, b)
@@ -115,9 +94,9 @@ def test_importance_transport_swaps_the_roles(fits, llvm, rng):
     assert change >= tolerance("plugin.reciprocity.min_change")
 
 
-def test_twosided_mirrors(fits, llvm, rng):
+def test_twosided_mirrors(fits, llvm, load_plugin, rng):
     mi = llvm
-    plugin = bsdf(mi, fits.path("raw"))
+    plugin = load_plugin(fits.path("raw"))
     both = mi.load_dict({"type": "twosided", "bsdf": plugin})
     a, b, uv = hemisphere(rng, 500), hemisphere(rng, 500), rng.random((500, 2))
     np.testing.assert_array_equal(value(mi, both, uv, a, b), value(mi, plugin, uv, a, b))
@@ -126,7 +105,7 @@ def test_twosided_mirrors(fits, llvm, rng):
 
 
 @pytest.mark.parametrize("key", methods())
-def test_maps_are_differentiable(key, llvm, rng, tmp_path):
+def test_maps_are_differentiable(key, llvm, load_plugin, rng, tmp_path):
     """The gradient of the mean value with respect to a map equals the difference quotient along a random direction."""
     import drjit as dr
 
@@ -136,7 +115,7 @@ def test_maps_are_differentiable(key, llvm, rng, tmp_path):
     storage = {"storage": "float"} if "storage" in inspect.signature(fit).parameters else {}
     path = tmp_path / f"oracle.{key}.exr"
     save(fit(oracle_btf((8, 6)), **storage), path)
-    plugin = bsdf(mi, path)
+    plugin = load_plugin(path)
     parameters = mi.traverse(plugin)
     # The largest differentiable map.
     name = max(
@@ -144,7 +123,7 @@ def test_maps_are_differentiable(key, llvm, rng, tmp_path):
         key=lambda n: len(parameters[n].array),
     )
     uv, w_light, w_view = rng.random((256, 2)), hemisphere(rng, 256), hemisphere(rng, 256)
-    si, wo = interaction(mi, uv, w_view), mi.Vector3f(w_light.T)
+    si, wo = surface(mi, len(uv), uv.T, w_view.T), mi.Vector3f(w_light.T)
     start = mi.TensorXf(parameters[name])
     # Of one sign, so that contributions do not cancel.
     step = mi.TensorXf(rng.random(start.shape).astype(np.float32))
@@ -170,7 +149,7 @@ def test_maps_are_differentiable(key, llvm, rng, tmp_path):
     assert abs(slope - difference) <= tolerance("plugin.gradient.max") * abs(difference)
 
 
-def test_renders_in_symbolic_mode(fits, llvm):
+def test_renders_in_symbolic_mode(fits, llvm, load_plugin):
     """A path-traced picture with loops and calls recorded, and the same one in evaluated mode."""
     import drjit as dr
 
@@ -184,8 +163,8 @@ def test_renders_in_symbolic_mode(fits, llvm):
                 "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
                 "film": {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}},
             },
-            "shape": {"type": "sphere", "bsdf": {"type": "twosided", "bsdf": bsdf(mi, fits.path("lpca"))}},
-            "other": {"type": "rectangle", "bsdf": bsdf(mi, fits.path("svd"))},
+            "shape": {"type": "sphere", "bsdf": {"type": "twosided", "bsdf": load_plugin(fits.path("lpca"))}},
+            "other": {"type": "rectangle", "bsdf": load_plugin(fits.path("svd"))},
             "light": {"type": "constant"},
         }
     )

@@ -2,18 +2,19 @@
 
 import numpy as np
 import pytest
-from probes import hemisphere, hit_allowance, probe_points
+from probes import hemisphere, probe_points
 
 from btfref.conventions import luminance
 from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
 from btfref.numerics.microfacets import geometry_factor, isotropic_ndf, schlick
-from btfref.numerics.sphere.directions import directions
 from btfref.numerics.sphere.parabolic import texel_directions, texel_solid_angles
 from btfref.numerics.sphere.quadrature import gauss_hemisphere
 from btfref.representations import load, save
 from btfref.representations.gbrdf.build import HUE_STEPS, from_maps, from_photograph
 from btfref.representations.gbrdf.maps import export_maps, hue_of_turns, import_maps, turns_of_hue
+from btfref.stress.evaluators import PORTS
+from btfref.stress.judging import port_agreement
 
 EXACT = tolerance("interpolation.exact.max")
 
@@ -37,21 +38,18 @@ def edited(rng, shape=(8, 6), **changes):
 def test_flat_lambert_is_diffuse_exactly(rng):
     colour = np.array([0.5, 0.25, 0.75])
     flat = from_maps(np.ones((5, 3)), diffuse=colour)
-    uv, w_light, w_view = probe_points(rng, 2000, directions("ubo81"), directions("ubo81"))
+    uv, w_light, w_view = probe_points(rng, 2000, flat)
     expected = colour / np.pi * w_light[:, 2:].astype(float)
     np.testing.assert_allclose(flat.evaluate(uv, w_light, w_view), expected, rtol=EXACT)
 
 
-def test_flat_lambert_is_mitsubas_diffuse(llvm, rng, tmp_path):
+def test_flat_lambert_is_mitsubas_diffuse(llvm, load_plugin, rng, tmp_path):
     import drjit as dr
 
-    import mitsuba_plugins
-
     mi = llvm
-    mitsuba_plugins.register()
     colour = [0.5, 0.25, 0.75]
     save(from_maps(np.ones((4, 4)), diffuse=colour), tmp_path / "flat.gbrdf.exr")
-    ours = mi.load_dict({"type": "btf", "filename": str(tmp_path / "flat.gbrdf.exr")})
+    ours = load_plugin(tmp_path / "flat.gbrdf.exr")
     theirs = mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": colour}})
     w_light, w_view = hemisphere(rng, 1000), hemisphere(rng, 1000)
     si = dr.zeros(mi.SurfaceInteraction3f, 1000)
@@ -147,42 +145,28 @@ EXTREMES = {
 
 @pytest.mark.parametrize("name", EXTREMES)
 def test_extremes_are_finite(name, rng):
-    sets = directions("ubo81")
-    value = edited(rng, **EXTREMES[name]).evaluate(*probe_points(rng, 4000, sets, sets))
+    rep = edited(rng, **EXTREMES[name])
+    value = rep.evaluate(*probe_points(rng, 4000, rep))
     assert np.isfinite(value).all()
     assert (value >= 0).all()
 
 
 @pytest.mark.parametrize("name", ["extreme height", "spikes", "largest half"])
-def test_extremes_agree(name, rng, need, llvm, tmp_path):
-    """Grazing lights and views among them, in all three evaluators."""
-    import drjit as dr
-
-    import mitsuba_plugins
-    from btfref.comparison.comparison import agreement
-    from btfref.rendering.gl.probe import probe
-
-    need("gl")
-    mi = llvm
-    mitsuba_plugins.register()
+def test_extremes_agree(name, rng, evaluator, tmp_path):
+    """Grazing lights and views among them, in all ports."""
     rep = edited(rng, **EXTREMES[name])
-    sets = directions("ubo81")
-    points = probe_points(rng, 4000, sets, sets)
-    value = rep.evaluate(*points)
+    points = probe_points(rng, 4000, rep)
     save(rep, tmp_path / "x.gbrdf.exr")
-    plugin = mi.load_dict({"type": "btf", "filename": str(tmp_path / "x.gbrdf.exr")})
-    si = dr.zeros(mi.SurfaceInteraction3f, 4000)
-    si.uv, si.wi = mi.Point2f(points[0].T), mi.Vector3f(points[2].T)
-    ported = np.array(plugin.eval(mi.BSDFContext(), si, mi.Vector3f(points[1].T))).T
-    for other in (ported, probe(rep, *points)):
-        for gate in agreement(other, value, allowance=hit_allowance(rep, other, value, points)).gates:
+    for port in PORTS:
+        value = evaluator(port, rep, tmp_path / "x.gbrdf.exr").evaluate(*points)
+        for gate in port_agreement(value, rep, points).gates:
             assert gate.passed, gate.line
 
 
 def test_few_lookups_are_at_an_edge(fits):
     """What the agreement gates let through because a hit may move is rare: they still judge nearly everything."""
-    rep, btf = fits("gbrdf"), fits.btf()
-    points = probe_points(np.random.default_rng(7), 4000, btf.views, btf.lights)
+    rep = fits("gbrdf")
+    points = probe_points(np.random.default_rng(7), 4000, rep)
     value = rep.evaluate(*points)
     share = (rep.spread(*points).max(-1) > tolerance("probe.agreement.max") * np.abs(value).max()).mean()
     assert share <= tolerance("gbrdf.edges.share")
@@ -190,17 +174,12 @@ def test_few_lookups_are_at_an_edge(fits):
 
 def test_a_march_that_stops_early_is_caught(rng):
     """The allowance does not hide a wrong hit: heights 1 % deeper fail the gate."""
-    from btfref.comparison.comparison import agreement
-
     rep = edited(rng)
     wrong = type(rep).from_arrays(
         rep.maps, rep.meta | {"constants": rep.meta["constants"] | {"height_min": -0.2025}}
     )
-    sets = directions("ubo81")
-    points = probe_points(rng, 4000, sets, sets)
-    other, value = wrong.evaluate(*points), rep.evaluate(*points)
-    found = agreement(other, value, allowance=hit_allowance(rep, other, value, points))
-    assert not found.passed
+    points = probe_points(rng, 4000, rep)
+    assert not port_agreement(wrong.evaluate(*points), rep, points).passed
 
 
 def test_hues_hold_every_turn():

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from oracle import oracle_btf
+from probes import hemisphere, probe_points
 
 from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
@@ -14,6 +15,8 @@ from btfref.representations import load, save
 from btfref.representations.analytic.rf_lobes import lobe_sum
 from btfref.representations.analytic.rf_poly import light_operator, terms
 from btfref.sampling import SampledBTF
+from btfref.stress.evaluators import DEFINITION, PORTS
+from btfref.stress.judging import port_agreement
 
 METHODS = ("rf_poly", "rf_lobes", "lafortune", "lafortune_lut")
 
@@ -116,14 +119,8 @@ def test_light_fades_to_the_horizon(need, key):
 
 
 @pytest.mark.parametrize("key", METHODS[1:])
-def test_any_stored_parameters_are_finite_everywhere(need, llvm, key, tmp_path, rng):
-    """The largest halves as exponents, peaks and coefficients: finite in all three evaluators."""
-    import drjit as dr
-
-    import mitsuba_plugins
-    from btfref.rendering.gl.probe import probe
-
-    need("gl")
+def test_any_stored_parameters_are_finite_everywhere(evaluator, key, tmp_path, rng):
+    """The largest halves as exponents, peaks and coefficients: finite in all evaluators."""
     fitted = method(key).fit(oracle_btf((4, 4)))
     extreme = np.array([65504, 1e-7, 0, -1, 1, 1e4, 1e3, -65504], np.float16)
     maps = dict(fitted.maps)
@@ -136,33 +133,19 @@ def test_any_stored_parameters_are_finite_everywhere(need, llvm, key, tmp_path, 
             )
     fitted = replace(fitted, maps=maps)
     save(fitted, tmp_path / f"extreme.{key}.exr")
-    w = rng.normal(size=(2, 2000, 3))
-    w[..., 2] = np.abs(w[..., 2])
-    w = (w / np.linalg.norm(w, axis=-1, keepdims=True)).astype(np.float32)
-    uv = rng.uniform(size=(2000, 2)).astype(np.float32)
-    assert np.isfinite(fitted.evaluate(uv, *w)).all()
-    assert np.isfinite(probe(fitted, uv, *w)).all()
-    mitsuba_plugins.register()
-    bsdf = llvm.load_dict({"type": "btf", "filename": str(tmp_path / f"extreme.{key}.exr")})
-    si = dr.zeros(llvm.SurfaceInteraction3f, 2000)
-    si.uv, si.wi = llvm.Point2f(uv.T), llvm.Vector3f(w[1].T)
-    assert np.isfinite(np.array(bsdf.eval(llvm.BSDFContext(), si, llvm.Vector3f(w[0].T)))).all()
+    points = rng.uniform(size=(2000, 2)).astype(np.float32), hemisphere(rng, 2000), hemisphere(rng, 2000)
+    for name in (DEFINITION, *PORTS):
+        subject = evaluator(name, fitted, tmp_path / f"extreme.{key}.exr")
+        assert np.isfinite(subject.evaluate(*points)).all()
 
 
 @pytest.mark.parametrize("lobes", [1, 3])
-def test_other_numbers_of_lobes(need, rng, lobes):
+def test_other_numbers_of_lobes(need, evaluator, rng, lobes):
     need("llvm")
-    need("gl")
-    from btfref.comparison import agreement
-    from btfref.rendering.gl.probe import probe
-
-    btf = oracle_btf((4, 4))
-    w = rng.normal(size=(2, 4000, 3))
-    w[..., 2] = np.abs(w[..., 2])
-    w = (w / np.linalg.norm(w, axis=-1, keepdims=True)).astype(np.float32)
-    uv = rng.uniform(size=(4000, 2)).astype(np.float32)
-    fitted = method("rf_lobes").fit(btf, lobes=lobes)
-    for gate in agreement(probe(fitted, uv, *w), fitted.evaluate(uv, *w)).gates:
+    fitted = method("rf_lobes").fit(oracle_btf((4, 4)), lobes=lobes)
+    points = probe_points(rng, 4000, fitted)
+    value = evaluator("glsl", fitted).evaluate(*points)
+    for gate in port_agreement(value, fitted, points).gates:
         assert gate.passed, gate.line
 
 

@@ -311,7 +311,7 @@ def test_parts_of_pairs(llvm, tmp_path):
         synthesize_store(tmp_path / "no.btf.zarr", "checker", only=part, **settings)
 
 
-def test_missing_tiles_are_no_numbers(llvm, tmp_path):
+def test_missing_tiles_are_no_numbers(llvm, load_plugin, tmp_path):
     settings = {"texels": (8, 70), "views": "10x5", "lights": [[0, 0, 1]], "spp": 2}
     part = Selection(views=tuple(range(15)), tiles=(1,))
     store = synthesize_store(tmp_path / "part.btf.zarr", "checker", only=part, **settings)
@@ -326,10 +326,7 @@ def test_missing_tiles_are_no_numbers(llvm, tmp_path):
     with pytest.raises(InputError, match="not resident"):
         again.evaluate([67.5 / 70, 0.3], up, store.views.vectors[40])
     assert np.isfinite(again.sampling_tables()[1]).all()
-    import mitsuba_plugins
-
-    mitsuba_plugins.register()
-    plugin = llvm.load_dict({"type": "btf", "filename": str(tmp_path / "part.raw.exr")})
+    plugin = load_plugin(tmp_path / "part.raw.exr")
     si = llvm.SurfaceInteraction3f()
     si.wi = llvm.Vector3f(view)
     for u, known in ((20, False), (67.5, True)):

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+from types import ModuleType
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from btfref.comparison.comparison import agreement
-from btfref.gates.verdicts import Measured, judge
-from btfref.validate.probes import hit_allowance, probe_points, unit
-from btfref.validate.sampling import chi_square, surface
+from btfref.gates.verdicts import GateResult, Measured, judge
+from btfref.stress.evaluators import EVALUATORS, PORTS, evaluator, surface
+from btfref.stress.judging import port_agreement
+from btfref.stress.lookups import USUAL, hard_lookups, unit
+from btfref.validate.sampling import chi_square
+
+if TYPE_CHECKING:
+    from btfref.types import JitArray, PathLike
 
 #: Gates of a method on its own.
 GATES = ("probe.agreement", "probe.finite", "chi2.rejected", "sample.weight", "sample.pdf")
@@ -27,8 +36,8 @@ VIEWS = {
 }
 
 
-def probe_gates(path, *, seed=7):
-    """Both ports against the float64 definition at ordinary and awkward lookups, and at all levels of detail.
+def probe_gates(path: PathLike, *, seed: int = 7) -> list[GateResult]:
+    """The ports against the float64 definition at ordinary and awkward lookups, and at all levels of detail.
 
     Parameters
     ----------
@@ -39,42 +48,28 @@ def probe_gates(path, *, seed=7):
     Returns
     -------
     list of GateResult
-        ``probe.agreement`` of Dr.Jit, then of GLSL, and ``probe.finite``; the detail says whose.
+        ``probe.agreement`` of each port, and ``probe.finite``; the detail says whose.
     """
-    from btfref.numerics.sphere.directions import DirectionSet
     from btfref.representations import load
-    from btfref.representations.protocol import max_lod
-    from btfref.stress.evaluators import definition, port
-    from btfref.stress.lookups import Lookups
 
     representation = load(path)
-    arrays = representation.arrays()
-    views, lights = (
-        DirectionSet(arrays[f"{name}_directions"].astype(float), "custom") for name in ("view", "light")
-    )
-    rng = np.random.default_rng(seed)
-    points = probe_points(rng, PROBES, views, lights)
-    lod = rng.uniform(0, max_lod(representation), PROBES).astype(np.float32)
-    drawn = [np.zeros(PROBES, np.uint8)] * 4
-    lookups = Lookups(*points, lod, *drawn)
-    reference = definition(representation, lookups)
+    lookups = hard_lookups(np.random.default_rng(seed), representation, PROBES, USUAL)
     gates, bad = [], 0
-    for key, name in {"drjit": "Dr.Jit", "glsl": "GLSL"}.items():
-        value = port(key, representation, path)(lookups)
-        allowance = hit_allowance(representation, value, reference, points)
-        found = agreement(value, reference, allowance=allowance)
-        gates += [_named(gate, name) for gate in found.gates]
+    for name in PORTS:
+        value = evaluator(name, representation, path).evaluate(*lookups.points, lod=lookups.lod)
+        found = port_agreement(value, representation, lookups.points, lookups.lod)
+        gates += [_named(gate, EVALUATORS[name].title) for gate in found.gates]
         bad += int(np.count_nonzero(~np.isfinite(value)))
     return gates + judge("probe.finite", {"nonfinite": Measured(bad)})
 
 
-def _named(gate, whose):
-    from dataclasses import replace
-
+def _named(gate: GateResult, whose: str) -> GateResult:
     return replace(gate, detail=f"{whose}{': ' if gate.detail else ''}{gate.detail}")
 
 
-def sampling_gates(path, *, samples, altered=None):
+def sampling_gates(
+    path: PathLike, *, samples: int, altered: Callable[[JitArray], JitArray] | None = None
+) -> list[GateResult]:
     """χ² of `sample()` against `pdf()`, and its weights against value over density.
 
     Parameters
@@ -91,9 +86,13 @@ def sampling_gates(path, *, samples, altered=None):
     list of GateResult
         ``chi2.rejected``, ``sample.weight``, ``sample.pdf``.
     """
-    mi, plugin = _plugin(path)
+    import mitsuba_plugins
+
+    mi, plugin = mitsuba_plugins.ready(), mitsuba_plugins.load(path)
     plugin = altered(plugin) if altered else plugin
-    failed, weights, pdfs = [], [], []
+    failed: list[str] = []
+    weights: list[float] = []
+    pdfs: list[float] = []
     places = [(name, unit(view), uv) for name, view in VIEWS.items() for uv in UVS]
     for name, w_view, uv in places:
         right, message = chi_square(mi, plugin, uv, w_view, samples=samples, tests=len(places))
@@ -111,7 +110,9 @@ def sampling_gates(path, *, samples, altered=None):
     ]
 
 
-def _weights(mi, plugin, uv, w_view, n=1 << 13):
+def _weights(
+    mi: ModuleType, plugin: JitArray, uv: tuple[float, float], w_view: np.ndarray, n: int = 1 << 13
+) -> tuple[float, float]:
     """Largest error of weight × density against the value, and of the density, relative."""
     rng, context = np.random.default_rng(5), mi.BSDFContext()
     si = surface(mi, n, uv, w_view)
@@ -120,18 +121,3 @@ def _weights(mi, plugin, uv, w_view, n=1 << 13):
     floor = 1e-3 * max(float(np.abs(value).max()), 1e-30)
     error = np.abs(np.array(weight) * pdf - value) / np.maximum(np.abs(value), floor)
     return float(error.max()), float((np.abs(np.array(bs.pdf) - pdf) / np.maximum(pdf, 1e-30)).max())
-
-
-def _plugin(path, **parameters):
-    from btfref.platform import prepare_llvm
-    from btfref.scene import parsing
-
-    prepare_llvm()
-    import mitsuba as mi
-
-    import mitsuba_plugins
-
-    if mi.variant() is None or "llvm" not in mi.variant():
-        parsing.use_variant("llvm_ad_rgb")
-    mitsuba_plugins.register()
-    return mi, mi.load_dict({"type": "btf", "filename": str(path), **parameters})
