@@ -107,7 +107,16 @@ _MASKS = ("views", "lights", "pairs", "texels")
 
 
 def demand(
-    scene, *, parameters=None, grid=4, size=None, margin=None, shape=None, indirect=False, progress=None
+    scene,
+    *,
+    parameters=None,
+    description=None,
+    grid=4,
+    size=None,
+    margin=None,
+    shape=None,
+    indirect=False,
+    progress=None,
 ):
     """What the direct light of a scene needs of its BTFs.
 
@@ -117,6 +126,8 @@ def demand(
         Mitsuba scene.
     parameters : dict of str to str, optional
         Values for ``$name`` in the file.
+    description : SceneDescription, optional
+        Of the same scene, where it was read before.
     grid : int
         n of the n × n sub-pixel samples.
     size : (int, int), optional
@@ -144,7 +155,8 @@ def demand(
     from btfref.scene.hits import surfaces
     from btfref.scene.loading import loaded
 
-    description = read_scene(scene, parameters, size=size, missing_btf=shape is not None)
+    if description is None:
+        description = read_scene(scene, parameters, size=size, missing_btf=shape is not None)
     least = max(MARGIN, description.camera.pixel_angle) if margin is None else margin
     wanted = {}
     for mesh in description.meshes:

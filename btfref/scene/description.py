@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from btfref.errors import InputError, MissingDependencyError
-from btfref.numerics.footprint import MODES
-from btfref.numerics.sphere.frames import uv_transform
 from btfref.platform import prepare_llvm
 from btfref.scene import parsing
 from btfref.scene.environment import Environment, from_emitter
@@ -19,11 +17,6 @@ __all__ = ["BtfMaterial", "Camera", "Light", "MeshDescription", "SceneDescriptio
 
 #: Reading scenes needs no LLVM: this variant is compiled ahead of time.
 VARIANT = "scalar_rgb"
-
-LIGHTS = ("directional", "point")
-
-#: Emitters infinitely far away on all sides; a scene has one at most.
-ENVIRONMENTS = ("envmap", "constant")
 
 
 @dataclass(frozen=True)
@@ -157,8 +150,8 @@ def read_scene(scene, parameters=None, *, size=None, missing_btf=False):
     nodes = {
         kind: [n for _, n in roots if parsing.is_kind(n, kind)] for kind in ("Sensor", "Emitter", "Shape")
     }
-    _check(parsed, nodes)
-    materials = [_material(parsed, node) for node in nodes["Shape"]]
+    parsing.check(parsed, nodes)
+    materials = [parsing.material_of(parsed, node) for node in nodes["Shape"]]
     parsing.plain(parsed)
     made = parsed.instantiate()
     if not isinstance(made, types.Scene) or len(made.shapes()) != len(nodes["Shape"]):
@@ -171,98 +164,12 @@ def read_scene(scene, parameters=None, *, size=None, missing_btf=False):
     lights, environment = [], None
     for node, emitter in zip(nodes["Emitter"], made.emitters(), strict=True):
         kind = node.props.plugin_name()
-        if kind in ENVIRONMENTS:
+        if kind in parsing.SURROUNDINGS:
             environment = from_emitter(kind, emitter, types, file=parsed.location(node))
         else:
             lights.append(_light(kind, emitter, types))
     camera = _camera(made.sensors()[0])
     return SceneDescription(camera, tuple(meshes), tuple(lights), parsed.source, environment)
-
-
-def _check(parsed, nodes):
-    import mitsuba as mi
-
-    if len(nodes["Sensor"]) != 1:
-        raise InputError(
-            "one sensor is needed", file=parsed.source, field="sensor", got=len(nodes["Sensor"]), expected=1
-        )
-    sensor = nodes["Sensor"][0]
-    if sensor.props.plugin_name() != "perspective":
-        where, got = parsed.location(sensor), sensor.props.plugin_name()
-        raise InputError("unsupported sensor", file=where, field="sensor", got=got, expected="perspective")
-    for key in ("principal_point_offset_x", "principal_point_offset_y"):
-        if key in sensor.props and float(sensor.props[key]) != 0:
-            raise InputError(
-                "unsupported sensor setting", file=parsed.location(sensor), field=key, expected=0
-            )
-    for _, film in parsed.children(sensor):
-        for key in ("crop_width", "crop_height", "crop_offset_x", "crop_offset_y"):
-            if parsing.is_kind(film, "Film") and key in film.props:
-                raise InputError("cropped films are not supported", file=parsed.location(film), field=key)
-    for node in nodes["Emitter"]:
-        if node.props.plugin_name() not in LIGHTS + ENVIRONMENTS:
-            where, got = parsed.location(node), node.props.plugin_name()
-            expected = " or ".join(LIGHTS + ENVIRONMENTS)
-            raise InputError("unsupported light", file=where, field="emitter", got=got, expected=expected)
-    for node in nodes["Shape"]:
-        for _, child in parsed.children(node):
-            if parsing.is_kind(child, "Emitter"):
-                where, got = parsed.location(child), child.props.plugin_name()
-                raise InputError(
-                    "unsupported light", file=where, field="emitter", got=got, expected=" or ".join(LIGHTS)
-                )
-    for node in parsed.nodes:
-        # Objects that were made before cannot be read under another variant.
-        for key, value in node.props.items():
-            made = type(value).__module__.startswith("mitsuba") and hasattr(value, "class_name")
-            if made and not isinstance(value, mi.Bitmap):
-                raise InputError("the scene holds a finished Mitsuba object", file=parsed.source, field=key)
-
-
-def _material(parsed, shape):
-    """Plugin name of the shape's BSDF and the BTF material, if it is one."""
-    bsdfs = [child for _, child in parsed.children(shape) if parsing.is_kind(child, "BSDF")]
-    if not bsdfs:
-        return "diffuse", None
-    node, twosided = bsdfs[0], False
-    plugin = node.props.plugin_name()
-    if plugin == "twosided":
-        inner = [child for _, child in parsed.children(node)]
-        if len(inner) > 1:
-            raise InputError(
-                "unsupported: twosided with two materials", file=parsed.location(node), field="twosided"
-            )
-        if inner:
-            node, twosided, plugin = inner[0], True, inner[0].props.plugin_name()
-    if plugin != parsing.BTF:
-        return plugin, None
-    props = node.props
-    filter_type = props["filter_type"] if "filter_type" in props else None
-    if filter_type not in (None, "nearest", "bilinear"):
-        where = parsed.location(node)
-        raise InputError(
-            "unknown texel filter",
-            file=where,
-            field="filter_type",
-            got=filter_type,
-            expected="nearest or bilinear",
-        )
-    matrix = np.eye(4) if "to_uv" not in props else np.array(props["to_uv"].matrix, float)
-    affine, _ = uv_transform(matrix, file=parsed.location(node))
-    numbers = {name: float(props[name]) for name in ("scale", "lod_bias", "lod_unit") if name in props}
-    mode = str(props["lod"]) if "lod" in props else "auto"
-    if mode not in MODES:
-        where, expected = parsed.location(node), " or ".join(MODES)
-        raise InputError("unknown level of detail", file=where, field="lod", got=mode, expected=expected)
-    if not numbers.get("lod_unit", 1.0) > 0:
-        where, got = parsed.location(node), numbers["lod_unit"]
-        raise InputError(
-            "the lod_unit is out of range", file=where, field="lod_unit", got=got, expected="> 0"
-        )
-    material = BtfMaterial(
-        props["filename"], filter_type, numbers.pop("scale", 1.0), affine, twosided, lod=mode, **numbers
-    )
-    return plugin, material
 
 
 def _camera(sensor):

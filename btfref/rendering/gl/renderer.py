@@ -91,9 +91,10 @@ def realtime(
         raise InputError("the sub-pixel grid needs a sample", field="grid", got=grid, expected="≥ 1")
     if keep != "all" and isinstance(scene, SceneDescription):
         raise InputError("the maps that are needed follow from a scene file", field="keep", got=keep)
-    needed = kept_maps(keep, scene, parameters, grid=grid, size=size, margin=MARGIN)
+    file = scene
     if not isinstance(scene, SceneDescription):
         scene = read_scene(scene, parameters, size=size)
+    needed = kept_maps(keep, file, parameters, description=scene, grid=grid, size=size, margin=MARGIN)
 
     def load_needed(path):
         return representations.load(path, **needed[path])
