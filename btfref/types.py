@@ -9,6 +9,9 @@ from typing import Any
 #: What names a file.
 PathLike = str | os.PathLike[str]
 
+#: A scene: Mitsuba's file, the name of a shipped one, or Mitsuba's dictionary.
+SceneLike = PathLike | dict[str, Any]
+
 #: Called as ``progress(done, total, label)``.
 Progress = Callable[[int, int, str], object]
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from btfref.types import JitArray
 
-def tell_camera(scene, share):
+
+def tell_camera(scene: JitArray, share: float) -> None:
     """Give the camera to the materials that choose a level of detail by the pixel's footprint.
 
     Stock integrators hand no texture derivatives to a BSDF. A ``pixel_angle`` that the scene itself sets is kept.
@@ -35,7 +37,9 @@ def tell_camera(scene, share):
     parameters.update()
 
 
-def film_rays(sensor, offset, pixel=None):
+def film_rays(
+    sensor: JitArray, offset: tuple[float | JitArray, float | JitArray], pixel: JitArray | None = None
+) -> tuple[JitArray, JitArray]:
     """Camera rays through the point ``offset`` of every pixel (from its top left corner), row by row.
 
     The offset is a pair of numbers, or of mitsuba.Float with one for each ray; ``pixel`` (mitsuba.UInt32) chooses
@@ -59,6 +63,6 @@ def film_rays(sensor, offset, pixel=None):
     return ray, weight
 
 
-def grid_offsets(n):
+def grid_offsets(n: int) -> list[tuple[float, float]]:
     """Sub-pixel samples ((i + ½)/n, (j + ½)/n), row by row."""
     return [((i + 0.5) / n, (j + 0.5) / n) for j in range(n) for i in range(n)]

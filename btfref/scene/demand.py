@@ -9,12 +9,24 @@ asks for it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.scene.first_hits import MARGIN, Touched
+from btfref.scene.first_hits import MARGIN as MARGIN
+from btfref.scene.first_hits import Touched
+from btfref.types import Progress, SceneLike
+
+if TYPE_CHECKING:
+    from btfref.representations.protocol import Representation
+    from btfref.sampling.store.selection import Selection
+    from btfref.scene.description import SceneDescription
+    from btfref.scene.first_hits import Shape
+    from btfref.scene.loading import Kept
+
 
 #: Which maps of a file renderers load.
 KEEP = ("all", "needed")
@@ -50,7 +62,7 @@ class Demand:
     lookups: int = 0
     maps: dict = field(default_factory=dict)
 
-    def __or__(self, other):
+    def __or__(self, other: Demand) -> Demand:
         """What either needs: several cameras, or frames of an animation."""
         if [a.shape for a in (self.pairs, self.texels)] != [a.shape for a in (other.pairs, other.texels)]:
             raise InputError("BTFs of different shapes", file=self.file, field="demand", got=other.file)
@@ -62,14 +74,14 @@ class Demand:
             maps={},
         )
 
-    def tiles(self, side):
+    def tiles(self, side: int) -> np.ndarray:
         """Tiles of ``side`` × ``side`` texels that hold a needed one, shape (tile rows, tile columns) bool."""
         rows, columns = (-(-n // side) for n in self.texels.shape)
         padded = np.zeros((rows * side, columns * side), bool)
         padded[: self.texels.shape[0], : self.texels.shape[1]] = self.texels
-        return padded.reshape(rows, side, columns, side).any((1, 3))
+        return np.any(padded.reshape(rows, side, columns, side), axis=(1, 3))
 
-    def part(self, side=None):
+    def part(self, side: int | None = None) -> Selection:
         """What to synthesize: a `btfref.sampling.store.selection.Selection` of pairs, and of tiles as stores have them.
 
         Raises
@@ -85,11 +97,11 @@ class Demand:
             raise InputError("the scene needs nothing of this BTF", file=self.file, field="demand")
         return Selection.of_pairs(self.pairs, tiles.tolist())
 
-    def first_level(self, total):
+    def first_level(self, total: int) -> int:
         """Finest of ``total`` levels of detail that is needed; a little finer than found, since renderers round."""
         return int(np.clip(np.floor(self.least_lod - LEVEL_MARGIN), 0, total - 1))
 
-    def shares(self):
+    def shares(self) -> dict[str, tuple[int, int]]:
         """Needed and whole numbers by what they count: views, lights, pairs, texels, samples, and further maps.
 
         Samples are texels of pairs.
@@ -107,17 +119,17 @@ _MASKS = ("views", "lights", "pairs", "texels")
 
 
 def demand(
-    scene,
+    scene: SceneLike,
     *,
-    parameters=None,
-    description=None,
-    grid=4,
-    size=None,
-    margin=None,
-    shape=None,
-    indirect=False,
-    progress=None,
-):
+    parameters: Mapping[str, object] | None = None,
+    description: SceneDescription | None = None,
+    grid: int = 4,
+    size: tuple[int, int] | None = None,
+    margin: float | None = None,
+    shape: Shape | None = None,
+    indirect: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Demand]:
     """What the direct light of a scene needs of its BTFs.
 
     Parameters
@@ -178,7 +190,14 @@ def demand(
     return {name: Demand(name, *found.result(from_everywhere, indirect)) for name, found in wanted.items()}
 
 
-def kept_maps(keep, scene, parameters=None, *, lights=True, **settings):
+def kept_maps(
+    keep: str,
+    scene: SceneLike,
+    parameters: Mapping[str, object] | None = None,
+    *,
+    lights: bool = True,
+    **settings: Any,
+) -> Kept:
     """The maps of a scene's files that a renderer loads, as :func:`btfref.representations.load` takes them.
 
     Parameters
@@ -210,7 +229,7 @@ def kept_maps(keep, scene, parameters=None, *, lights=True, **settings):
     }
 
 
-def number_kept(kept):
+def number_kept(kept: Kept) -> dict[str, dict[str, int]]:
     """How many maps are kept, by file and by what was chosen."""
     return {
         file: {kind: len(chosen) for kind, chosen in choices.items() if chosen is not None}
@@ -218,7 +237,7 @@ def number_kept(kept):
     }
 
 
-def choice(one, *, lights=True):
+def choice(one: Demand, *, lights: bool = True) -> dict[str, np.ndarray | None]:
     """What to keep of the file of a :class:`Demand`; see :func:`kept_maps`."""
     from btfref.registry import method
     from btfref.representations.file.container import read_info, read_maps
@@ -227,12 +246,11 @@ def choice(one, *, lights=True):
 
     file = one.file
     made = method(read_info(file)["method"], file=file).representation
-    chosen = {"views": one.views, "lights": one.lights if lights else None}
+    chosen: dict[str, np.ndarray | None] = dict.fromkeys(("views", "lights", "entries", "levels"))
     for kind in KINDS:
-        mask = chosen[f"{kind}s"]
-        known = mask is not None and mask.any() and direction_axes(made, kind)
-        chosen[f"{kind}s"] = np.flatnonzero(mask) if known else None
-    chosen["entries"], chosen["levels"] = None, None
+        mask = one.views if kind == "view" else one.lights
+        if (lights or kind == "view") and mask.any() and direction_axes(made, kind):
+            chosen[f"{kind}s"] = np.flatnonzero(mask)
     if isinstance(made, HasEntries) and one.texels.any():
         names = made.ENTRIES
         arrays, meta = read_maps(file, lambda name: name == names.index)
@@ -245,7 +263,7 @@ def choice(one, *, lights=True):
     return chosen
 
 
-def maps_needed(demanded, representation):
+def maps_needed(demanded: Demand, representation: Representation) -> Demand:
     """The same demand with what it needs of a representation's levels and of the entries of its index maps.
 
     Parameters

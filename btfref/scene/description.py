@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import ModuleType
 
 import numpy as np
 
@@ -12,6 +14,7 @@ from btfref.platform import prepare_llvm
 from btfref.scene import parsing
 from btfref.scene.environment import Environment, from_emitter
 from btfref.scene.shapes import BtfMaterial, MeshDescription, triangles_of
+from btfref.types import JitArray, SceneLike
 
 __all__ = ["BtfMaterial", "Camera", "Light", "MeshDescription", "SceneDescription", "read_scene"]
 
@@ -43,17 +46,17 @@ class Camera:
     far: float
 
     @property
-    def origin(self):
+    def origin(self) -> np.ndarray:
         """Position in world space, shape (3,)."""
         return self.to_world[:3, 3]
 
     @property
-    def tangents(self):
+    def tangents(self) -> tuple[float, float]:
         """Half extents of the image at distance 1: horizontal, vertical."""
         x = np.tan(0.5 * self.x_fov)
         return x, x * self.height / self.width
 
-    def ray_basis(self):
+    def ray_basis(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Directions of film points: ``corner + x · right + y · down``, in pixels from the top left.
 
         Returns
@@ -67,11 +70,11 @@ class Camera:
         return corner, -2 * tan_x / self.width * left, -2 * tan_y / self.height * up
 
     @property
-    def pixel_angle(self):
+    def pixel_angle(self) -> float:
         """Angle that a pixel at the middle of the image subtends, in radians."""
         return 2 * self.tangents[0] / self.width
 
-    def depth(self, points):
+    def depth(self, points: np.ndarray) -> np.ndarray:
         """Distances of points along the optical axis, shape (..., 3) -> (...)."""
         forward = self.to_world[:3, 2] / np.linalg.norm(self.to_world[:3, 2])
         return (points - self.origin) @ forward
@@ -115,8 +118,26 @@ class SceneDescription:
     source: str
     environment: Environment | None = None
 
+    def demand_btfs(self, what: str) -> None:
+        """Refuse shapes without a BTF, in the name of ``what``.
 
-def read_scene(scene, parameters=None, *, size=None, missing_btf=False):
+        Raises
+        ------
+        InputError
+        """
+        for mesh in self.meshes:
+            if mesh.material is None:
+                where = f"{self.source}: shape {mesh.name}"
+                raise InputError(f"{what} needs a btf material", file=where, field="bsdf", got=mesh.bsdf)
+
+
+def read_scene(
+    scene: SceneLike,
+    parameters: Mapping[str, object] | None = None,
+    *,
+    size: tuple[int, int] | None = None,
+    missing_btf: bool = False,
+) -> SceneDescription:
     """Read a Mitsuba scene.
 
     Parameters
@@ -172,7 +193,7 @@ def read_scene(scene, parameters=None, *, size=None, missing_btf=False):
     return SceneDescription(camera, tuple(meshes), tuple(lights), parsed.source, environment)
 
 
-def _camera(sensor):
+def _camera(sensor: JitArray) -> Camera:
     import mitsuba as mi
 
     values = mi.traverse(sensor)
@@ -182,7 +203,7 @@ def _camera(sensor):
     return Camera(to_world, float(np.radians(float(values["x_fov"]))), width, height, *clip)
 
 
-def _light(kind, emitter, types):
+def _light(kind: str, emitter: JitArray, types: ModuleType) -> Light:
     """What the emitter sends, asked of Mitsuba itself: spectra and transforms are then its own."""
     point = types.SurfaceInteraction3f()
     point.p = [0.0, 0.0, 0.0]

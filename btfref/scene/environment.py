@@ -8,11 +8,15 @@ Conventions (Mitsuba 3.9, ``src/emitters/envmap.cpp``), in the emitter's own fra
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from types import ModuleType
+from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.conventions import LUMINANCE
 from btfref.errors import InputError
+from btfref.types import JitArray, PathLike
 
 #: Rows of the samples of a sun and sky: 0.18 degrees, a third of the sun's diameter.
 SUN_ROWS = 1000
@@ -44,7 +48,7 @@ class Environment:
     to_world: np.ndarray = field(default_factory=lambda: np.eye(3))
     name: str = "environment"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         shape = np.shape(self.radiance)
         if len(shape) != 3 or shape[2] != 3 or shape[0] < 2 or shape[1] < 1:
             raise InputError(
@@ -59,7 +63,7 @@ class Environment:
         if not np.allclose(self.to_world @ self.to_world.T, np.eye(3), atol=1e-5):
             raise InputError("the environment's transform is no rotation", field="to_world", got=self.name)
 
-    def evaluate(self, w):
+    def evaluate(self, w: ArrayLike) -> np.ndarray:
         """Radiance from the directions ``w``.
 
         Parameters
@@ -76,7 +80,7 @@ class Environment:
         v = np.arccos(np.clip(d[..., 1], -1, 1)) / np.pi
         return self.at(u, v)
 
-    def at(self, u, v):
+    def at(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Radiance at coordinates of the picture, ``v`` in [0, 1]; shape (...) -> (..., 3)."""
         rows, columns = self.radiance.shape[:2]
         x, y = u * columns - 0.5, v * (rows - 1)
@@ -90,7 +94,7 @@ class Environment:
         lower = (1 - fx) * texel(r0 + 1, c0) + fx * texel(r0 + 1, c1)
         return (1 - fy) * upper + fy * lower
 
-    def cells(self, rows=CELL_ROWS):
+    def cells(self, rows: int = CELL_ROWS) -> tuple[np.ndarray, np.ndarray]:
         """The environment as a few thousand small lights.
 
         The interpolated radiance is integrated over cells of equal angles; each light stands at the luminance's
@@ -143,13 +147,13 @@ class Environment:
         return centre @ self.to_world.T, power
 
 
-def cell_angles(rows=CELL_ROWS):
+def cell_angles(rows: int = CELL_ROWS) -> np.ndarray:
     """Solid angles of the cells of :meth:`Environment.cells`, shape (2 rows²,)."""
     border = np.cos(np.arange(rows + 1) * (np.pi / rows))
     return np.repeat((border[:-1] - border[1:]) * (np.pi / rows), 2 * rows)
 
 
-def constant(radiance=(1.0, 1.0, 1.0)):
+def constant(radiance: ArrayLike = (1.0, 1.0, 1.0)) -> Environment:
     """The same radiance from everywhere.
 
     Parameters
@@ -159,7 +163,13 @@ def constant(radiance=(1.0, 1.0, 1.0)):
     return Environment(np.broadcast_to(np.asarray(radiance, np.float32), (3, 2, 3)), name="constant")
 
 
-def bright_texel(direction, *, shape=(64, 128), irradiance=1.0, background=0.0):
+def bright_texel(
+    direction: ArrayLike,
+    *,
+    shape: tuple[int, int] = (64, 128),
+    irradiance: float = 1.0,
+    background: float = 0.0,
+) -> Environment:
     """One bright texel on a dark sky: the response of a method to a small light.
 
     Parameters
@@ -183,7 +193,13 @@ def bright_texel(direction, *, shape=(64, 128), irradiance=1.0, background=0.0):
     return Environment((background + picture * (irradiance / total)).astype(np.float32), name="bright texel")
 
 
-def sunsky(*, shape=(256, 512), turbidity=3.0, sun_direction=(0.4, 0.3, 0.86), up="z"):
+def sunsky(
+    *,
+    shape: tuple[int, int] = (256, 512),
+    turbidity: float = 3.0,
+    sun_direction: ArrayLike = (0.4, 0.3, 0.86),
+    up: Literal["y", "z"] = "z",
+) -> Environment:
     """Mitsuba's sun and sky as a picture.
 
     Parameters
@@ -239,7 +255,9 @@ def sunsky(*, shape=(256, 512), turbidity=3.0, sun_direction=(0.4, 0.3, 0.86), u
     return Environment(sky.astype(np.float32), to_world, "sunsky")
 
 
-def from_emitter(kind, emitter, types, *, file=None):
+def from_emitter(
+    kind: str, emitter: JitArray, types: ModuleType, *, file: PathLike | None = None
+) -> Environment:
     """The environment of a Mitsuba emitter, asked of the emitter itself.
 
     Parameters

@@ -7,6 +7,7 @@ so does :data:`Z_UP`: directions here are the world's.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -42,7 +43,7 @@ WALLS, FLOOR = 0.06, 0.03
 
 
 @cache
-def shipped(name):
+def shipped(name: str) -> Environment:
     """The environment of a name.
 
     Parameters
@@ -66,7 +67,7 @@ def shipped(name):
     sky = re.fullmatch(r"sky(\d{1,2})?", name)
     if sky and (sky[1] is None or 1 <= int(sky[1]) <= 90):
         return sky_at(int(sky[1] or ELEVATION))
-    makers = {
+    makers: dict[str, Callable[[], Environment]] = {
         "constant": constant,
         "studio": studio,
         "harmonics": lambda: harmonic_environment()[0],
@@ -81,12 +82,12 @@ def shipped(name):
     return makers[name]()
 
 
-def is_shipped(name):
+def is_shipped(name: str) -> bool:
     """Whether :func:`shipped` knows the name."""
     return name in ENVIRONMENTS or re.fullmatch(r"sky([1-9]|[1-8]\d|90)", name) is not None
 
 
-def sky_at(elevation, *, shape=(256, 512), turbidity=3.0):
+def sky_at(elevation: float, *, shape: tuple[int, int] = (256, 512), turbidity: float = 3.0) -> Environment:
     """Sun and sky with the sun at an elevation.
 
     Parameters
@@ -102,7 +103,7 @@ def sky_at(elevation, *, shape=(256, 512), turbidity=3.0):
     return Environment(made.radiance, made.to_world, f"sky{elevation:g}")
 
 
-def picture_directions(rows, columns, fine=1):
+def picture_directions(rows: int, columns: int, fine: int = 1) -> np.ndarray:
     """Directions of the texels of a picture, world space, shape (rows · fine, columns · fine, 3).
 
     With ``fine`` above 1: of samples spread evenly over each texel's extent.
@@ -114,7 +115,7 @@ def picture_directions(rows, columns, fine=1):
     return np.stack([np.sin(v) * np.sin(u), np.cos(v), -np.sin(v) * np.cos(u)], -1) @ Z_UP.T
 
 
-def studio(*, shape=(128, 256), fine=4):
+def studio(*, shape: tuple[int, int] = (128, 256), fine: int = 4) -> Environment:
     """Soft boxes around the scene, seen from its origin.
 
     Parameters
@@ -126,8 +127,8 @@ def studio(*, shape=(128, 256), fine=4):
     rows, columns = shape
     d = picture_directions(rows, columns, fine)
     radiance = np.where(d[..., 2:] > 0, WALLS, FLOOR) * np.ones(3)
-    for centre, half_u, half_v, power in SOFTBOXES:
-        centre, half_u, half_v = (np.array(a) for a in (centre, half_u, half_v))
+    for *extent, power in SOFTBOXES:
+        centre, half_u, half_v = np.array(extent)
         normal = np.cross(half_u, half_v)
         slope = d @ normal
         ahead = slope * (centre @ normal) > 0
@@ -139,7 +140,9 @@ def studio(*, shape=(128, 256), fine=4):
     return Environment(radiance.astype(np.float32), Z_UP, "studio")
 
 
-def harmonic_environment(*, order=ORDER, seed=0, shape=(256, 512)):
+def harmonic_environment(
+    *, order: int = ORDER, seed: int = 0, shape: tuple[int, int] = (256, 512)
+) -> tuple[Environment, np.ndarray]:
     """A random environment of a few bands, whose coefficients are known.
 
     Parameters

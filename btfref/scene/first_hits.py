@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from btfref.conventions import texel_stencil
 from btfref.numerics.sphere import interpolation
 from btfref.scene.hits import Hits
+from btfref.types import JitArray, PathLike
+
+if TYPE_CHECKING:
+    from btfref.numerics.sphere.directions import DirectionSet
+    from btfref.numerics.sphere.interpolation import Interpolation
+    from btfref.representations.protocol import SeesTexels
+    from btfref.scene.description import Camera
+    from btfref.scene.hits import Surface
+    from btfref.scene.shapes import BtfMaterial
+
+
+#: Views, lights and texels (rows, columns) of a BTF.
+Shape = tuple["DirectionSet", "DirectionSet", tuple[int, int]]
 
 #: Least margin of directions, radians: renderers round.
 MARGIN = 1e-4
@@ -31,9 +46,9 @@ class Touched:
         Radians by which directions may be off at least.
     """
 
-    def __init__(self, file, shape, margin):
+    def __init__(self, file: PathLike, shape: Shape | None, margin: float) -> None:
         #: Representation whose lookups read texels elsewhere than at their coordinates.
-        self.surface = None
+        self.surface: SeesTexels | None = None
         if shape is None:
             from btfref.registry import method
             from btfref.representations.file.container import load, read_maps
@@ -44,7 +59,9 @@ class Touched:
             self.tables = [interpolation.from_arrays(arrays, kind) for kind in ("view", "light")]
             counts = [meta[f"{kind}s"]["count"] for kind in ("view", "light")]
             if isinstance(method(meta["method"], file=file).representation, SeesTexels):
-                self.surface = load(file)
+                loaded = load(file)
+                assert isinstance(loaded, SeesTexels)
+                self.surface = loaded
         else:
             views, lights, self.size = shape
             self.tables, counts = [views.interpolation, lights.interpolation], [len(views), len(lights)]
@@ -55,7 +72,15 @@ class Touched:
         self.pairs, self.texels = np.zeros(counts, bool), np.zeros(self.size, bool)
         self.least_lod, self.lookups = np.inf, 0
 
-    def add(self, surface, shape, material, camera, angle, beside=None):
+    def add(
+        self,
+        surface: Surface,
+        shape: JitArray,
+        material: BtfMaterial,
+        camera: Camera,
+        angle: float,
+        beside: tuple[int, float] | None = None,
+    ) -> None:
         """Count the lookups of one shape's first hits.
 
         Parameters
@@ -95,7 +120,7 @@ class Touched:
             self.lights[light_sets.all_touched()] = True
             _mark_pairs(self.pairs, view_sets, light_sets, lit)
 
-    def _margins(self, w, seen, beside):
+    def _margins(self, w: np.ndarray, seen: np.ndarray, beside: tuple[int, float] | None) -> np.ndarray:
         """By what directions of the seen lookups may be off: by what they change to those of neighbouring pixels."""
         if beside is None:
             return np.full(int(seen.sum()), self.margin)
@@ -114,7 +139,7 @@ class Touched:
             np.maximum(second, step, out=second)
         return change[seen]
 
-    def _touched(self, table, w, margin):
+    def _touched(self, table: Interpolation, w: np.ndarray, margin: np.ndarray) -> _Sets:
         """Sets of the samples with weight at each direction or within the margin of it."""
         index, weight = [], []
         for shift in _SHIFTS:
@@ -123,7 +148,7 @@ class Touched:
             weight.append(some[1])
         return _Sets.of_rows(np.where(np.concatenate(weight, 1) > 0, np.concatenate(index, 1), -1))
 
-    def _touch_texels(self, uv, w_view):
+    def _touch_texels(self, uv: np.ndarray, w_view: np.ndarray) -> None:
         there = np.zeros(self.size, bool)
         if self.surface is None:
             index, _ = texel_stencil(uv, self.size, "bilinear")
@@ -137,7 +162,9 @@ class Touched:
             for columns in (-1, 0, 1):
                 self.texels |= np.roll(there, (rows, columns), (0, 1))
 
-    def result(self, from_everywhere, indirect):
+    def result(
+        self, from_everywhere: bool, indirect: bool
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, int]:
         """Views, lights, pairs, texels, finest level and number of lookups, as of :class:`btfref.scene.demand.Demand`.
 
         All lights where they come from everywhere, and all views where light is reflected on.
@@ -161,11 +188,11 @@ class _Sets:
         Set of each lookup.
     """
 
-    def __init__(self, rows, which):
+    def __init__(self, rows: np.ndarray, which: np.ndarray) -> None:
         self.rows, self.which = rows, which
 
     @classmethod
-    def of_rows(cls, rows):
+    def of_rows(cls, rows: np.ndarray) -> _Sets:
         """From the members of each lookup's set; equal sets in another order count as another set."""
         # Sorting the rows themselves would take ten times as long as sorting one number of each.
         factors = np.random.default_rng(0).integers(1, 2**63, rows.shape[1], np.uint64)
@@ -174,12 +201,12 @@ class _Sets:
             _, first, which = np.unique(rows, axis=0, return_index=True, return_inverse=True)
         return cls(rows[first], which.ravel())
 
-    def all_touched(self):
+    def all_touched(self) -> np.ndarray:
         """Members of any set."""
         return np.unique(self.rows[self.rows >= 0])
 
 
-def _mark_pairs(pairs, views, lights, lit):
+def _mark_pairs(pairs: np.ndarray, views: _Sets, lights: _Sets, lit: np.ndarray) -> None:
     """Mark all pairs of a lookup's views and lights; ``lights`` has the lookups of ``lit`` alone."""
     n_sets = len(lights.rows)
     both = np.unique(views.which[lit].astype(np.int64) * n_sets + lights.which)
@@ -195,7 +222,7 @@ def _mark_pairs(pairs, views, lights, lit):
         pairs.reshape(-1)[flat[inside]] = True
 
 
-def _upper(w):
+def _upper(w: np.ndarray) -> np.ndarray:
     """Unit vectors above the horizon nearest to ``w``."""
     w = np.array(w)
     w[:, 2] = np.maximum(w[:, 2], 1e-6)

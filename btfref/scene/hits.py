@@ -239,10 +239,9 @@ def corner_frames(mesh: MeshDescription) -> np.ndarray:
     -------
     ndarray of float64, shape (triangles, 3, 3, 3)
     """
-    assert mesh.material is not None
     _, normals, _, dp_du = mesh.corners()
     normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
-    return np.swapaxes(turned_frame(shading_frame(normals, dp_du[:, None]), mesh.material), -1, -2)
+    return np.swapaxes(turned_frame(shading_frame(normals, dp_du[:, None]), mesh.btf), -1, -2)
 
 
 def turned_frame(frame: np.ndarray, material: BtfMaterial) -> np.ndarray:

@@ -6,8 +6,21 @@ default Gaussian filter mixes pixels and its float16 files round.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
 from btfref.errors import InputError
 from btfref.scene import parsing
+from btfref.types import JitArray, SceneLike
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from btfref.scene.parsing import ParsedScene
+
+
+#: Maps of files that are loaded: file to "views", "lights", "entries" and "levels", None where all are.
+Kept = Mapping[str, Mapping[str, "np.ndarray | None"]]
 
 
 class loaded:  # noqa: N801 - a context manager that reads as a verb
@@ -17,11 +30,20 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
     maps are loaded: file to the materials' parameters ``views``, ``lights``, ``entries`` and ``levels``.
     """
 
-    def __init__(self, scene, parameters=None, *, variant="llvm_ad_rgb", size=None, plain=False, kept=None):
+    def __init__(
+        self,
+        scene: SceneLike,
+        parameters: Mapping[str, object] | None = None,
+        *,
+        variant: str = "llvm_ad_rgb",
+        size: tuple[int, int] | None = None,
+        plain: bool = False,
+        kept: Kept | None = None,
+    ) -> None:
         self._arguments = scene, parameters, variant, size, plain, kept
         self._before = None
 
-    def __enter__(self):
+    def __enter__(self) -> JitArray:
         scene, parameters, variant, size, plain, kept = self._arguments
         if variant.startswith("llvm"):
             from btfref.platform import prepare_llvm
@@ -58,15 +80,15 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
             self.__exit__()
             raise
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         if self._before is not None:
             parsing.use_variant(self._before)
 
 
-def _btf_shapes(parsed):
+def _btf_shapes(parsed: ParsedScene) -> dict[str, str]:
     """Identifier → place of every shape with a BTF; to be asked before instantiation consumes the tree."""
 
-    def shows_btf(node):
+    def shows_btf(node: JitArray) -> bool:
         materials = [child for _, child in parsed.children(node) if parsing.is_kind(child, "BSDF")]
         return any(node.props.plugin_name() == parsing.BTF or shows_btf(node) for node in materials)
 
@@ -74,7 +96,7 @@ def _btf_shapes(parsed):
     return {node.props.id(): parsed.location(node) for node in shapes}
 
 
-def _demand_texture_coordinates(made, btf_shapes):
+def _demand_texture_coordinates(made: JitArray, btf_shapes: dict[str, str]) -> None:
     """Refuse meshes with a BTF but no uv: Mitsuba would use the triangles' barycentric coordinates."""
     for shape in made.shapes():
         if shape.id() in btf_shapes and shape.is_mesh() and not shape.has_vertex_texcoords():
@@ -82,7 +104,7 @@ def _demand_texture_coordinates(made, btf_shapes):
             raise InputError("the shape has no texture coordinates", file=place, field=shape.id())
 
 
-def _plain_film(parsed, index):
+def _plain_film(parsed: ParsedScene, index: int) -> None:
     """Box filter and float32 RGB, whatever the scene says; ``index`` is the film's node."""
     import mitsuba as mi
 

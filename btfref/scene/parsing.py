@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import importlib
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 
@@ -19,6 +21,7 @@ from btfref.representations.file.container import refuse_store
 from btfref.scene.parameters import check_parameters
 from btfref.scene.shapes import BtfMaterial
 from btfref.scene.shipped import ENVIRONMENTS, scene_file
+from btfref.types import JitArray, SceneLike
 
 #: Emitters that shine on each point from one direction, and those infinitely far away on all sides: one at most.
 DELTA_LIGHTS, SURROUNDINGS = ("directional", "point"), ("envmap", "constant")
@@ -39,16 +42,16 @@ class ParsedScene:
         The scene file, or "scene dictionary".
     """
 
-    state: object
-    config: object
+    state: JitArray
+    config: JitArray
     source: str
 
     @property
-    def nodes(self):
+    def nodes(self) -> JitArray:
         """All nodes, referenced by index."""
         return self.state.nodes
 
-    def location(self, node):
+    def location(self, node: JitArray) -> str:
         """File and line of a node, for error messages."""
         import mitsuba as mi
 
@@ -57,7 +60,7 @@ class ParsedScene:
         except RuntimeError:
             return self.source
 
-    def children(self, node):
+    def children(self, node: JitArray) -> list[tuple[int, JitArray]]:
         """Nodes that ``node`` refers to, in their order, as ``(index, node)``."""
         result = []
         for key in node.props.keys():
@@ -66,7 +69,7 @@ class ParsedScene:
                 result.append((value.index(), self.nodes[value.index()]))
         return result
 
-    def instantiate(self):
+    def instantiate(self) -> JitArray:
         """The Mitsuba scene.
 
         Raises
@@ -85,7 +88,7 @@ class ParsedScene:
         return made[0] if isinstance(made, list) else made
 
 
-def one_line(error):
+def one_line(error: Exception) -> str:
     """Mitsuba's message without its C++ source positions and without the traceback of a plugin in Python."""
     text = re.sub(r"\[[\w./]+\.(?:cpp|h):\d+\]\s*", "", str(error))
     # The last line of a traceback is the exception, after its class name.
@@ -95,7 +98,7 @@ def one_line(error):
     return " ".join(text.split())
 
 
-def use_variant(name):
+def use_variant(name: str) -> None:
     """Make ``name`` the current Mitsuba variant.
 
     Raises
@@ -111,7 +114,7 @@ def use_variant(name):
         mi.set_variant(name)
 
 
-def scalar_types():
+def scalar_types() -> ModuleType:
     """Mitsuba's types of the variant ``scalar_rgb``, whatever the current one is.
 
     To set that variant and the former one again takes 0.2 s: Mitsuba compiles its integrators in Python anew.
@@ -123,7 +126,14 @@ def scalar_types():
     return importlib.import_module("mitsuba.scalar_rgb")
 
 
-def parse(scene, parameters=None, *, variant, size=None, missing_btf=False):
+def parse(
+    scene: SceneLike,
+    parameters: Mapping[str, object] | None = None,
+    *,
+    variant: str,
+    size: tuple[int, int] | None = None,
+    missing_btf: bool = False,
+) -> ParsedScene:
     """Parse a scene for a variant.
 
     Parameters
@@ -155,34 +165,32 @@ def parse(scene, parameters=None, *, variant, size=None, missing_btf=False):
     config = mi.parser.ParserConfig(variant)
     config.merge_equivalent = False
     config.merge_meshes = False
-    parameters = {key: str(value) for key, value in (parameters or {}).items()}
-    is_dict = isinstance(scene, dict)
-    if not is_dict:
-        scene = scene_file(scene)
-    source = "scene dictionary" if is_dict else str(scene)
-    if is_dict and parameters:
-        raise InputError("only scene files have parameters", field="parameters", got=", ".join(parameters))
-    if not is_dict and not Path(scene).is_file():
+    values = {key: str(value) for key, value in (parameters or {}).items()}
+    file = None if isinstance(scene, dict) else scene_file(scene)
+    source = "scene dictionary" if file is None else str(file)
+    if file is None and values:
+        raise InputError("only scene files have parameters", field="parameters", got=", ".join(values))
+    if file is not None and not file.is_file():
         raise InputError("a folder, not a scene", file=source)
-    if not is_dict:
-        check_parameters(Path(scene), parameters)
+    if file is not None:
+        check_parameters(file, values)
     try:
-        if is_dict:
+        if file is None:
             state = mi.parser.parse_dict(config, scene)
         else:
-            state = mi.parser.parse_file(config, str(scene), **parameters)
+            state = mi.parser.parse_file(config, str(file), **values)
         mi.parser.transform_all(config, state)
     except (RuntimeError, ValueError, TypeError) as error:
         raise InputError(one_line(error), file=source) from error
     parsed = ParsedScene(state, config, source)
     for node in parsed.nodes:
-        _resolve_file(parsed, node, None if is_dict else Path(scene).resolve().parent, missing_btf)
+        _resolve_file(parsed, node, None if file is None else file.resolve().parent, missing_btf)
         if _is(node, "Film") and size is not None:
             node.props["width"], node.props["height"] = int(size[0]), int(size[1])
     return parsed
 
 
-def plain(parsed):
+def plain(parsed: ParsedScene) -> None:
     """Replace what the geometry does not need, so that no material, texture or integrator is loaded."""
     import mitsuba as mi
 
@@ -196,11 +204,11 @@ def plain(parsed):
             node.type = getattr(mi.ObjectType, kind)
 
 
-def _is(node, kind):
+def _is(node: JitArray, kind: str) -> bool:
     return str(node.type) == f"ObjectType.{kind}"
 
 
-def is_kind(node, kind):
+def is_kind(node: JitArray, kind: str) -> bool:
     """Whether a node is a "Shape", "BSDF", "Emitter", "Sensor", "Film", and so on.
 
     In dictionaries, plugins that the current variant does not know come without a type.
@@ -208,7 +216,9 @@ def is_kind(node, kind):
     return _is(node, kind) or (kind == "BSDF" and node.props.plugin_name() == BTF)
 
 
-def _resolve_file(parsed, node, beside, missing_btf=False):
+def _resolve_file(
+    parsed: ParsedScene, node: JitArray, beside: Path | None, missing_btf: bool = False
+) -> None:
     """Make the node's relative file name absolute.
 
     Mitsuba looks beside the scene file only when it loads the file itself. BTF files come from the command
@@ -232,7 +242,7 @@ def _resolve_file(parsed, node, beside, missing_btf=False):
         raise InputError("no such BTF file", file=parsed.location(node), field="filename", got=name)
 
 
-def _shipped_environment(parsed, node, name):
+def _shipped_environment(parsed: ParsedScene, node: JitArray, name: str) -> None:
     """Give an ``envmap`` the picture of a shipped environment that its file name stands for."""
     import mitsuba as mi
 
@@ -247,7 +257,7 @@ def _shipped_environment(parsed, node, name):
     node.props["bitmap"] = mi.Bitmap(np.ascontiguousarray(shipped(name).radiance))
 
 
-def check(parsed, nodes):
+def check(parsed: ParsedScene, nodes: Mapping[str, list[JitArray]]) -> None:
     """Refuse what real-time rendering does not have: sensors, films, lights, finished objects.
 
     Parameters
@@ -303,7 +313,7 @@ def check(parsed, nodes):
                 raise InputError("the scene holds a finished Mitsuba object", file=parsed.source, field=key)
 
 
-def material_of(parsed, shape):
+def material_of(parsed: ParsedScene, shape: JitArray) -> tuple[str, BtfMaterial | None]:
     """Plugin name of the shape's BSDF, and the BTF material if it is one.
 
     Returns

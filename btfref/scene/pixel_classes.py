@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from btfref.conventions import PixelClass
 from btfref.scene.camera import film_rays, grid_offsets
 from btfref.scene.lights import is_delta
 from btfref.scene.loading import loaded
+from btfref.types import JitArray, SceneLike
 
 #: A step between neighbouring samples that leaves the tangent plane by more than this share of a pixel's
 #: footprint is an edge. A smooth surface of curvature κ leaves it by κ s²/2 (s the distance of the samples),
@@ -31,7 +34,14 @@ EDGE = 1e-3
 TURN = 1e-4
 
 
-def pixel_classes(scene, *, parameters=None, size=None, grid=4, variant="llvm_ad_rgb"):
+def pixel_classes(
+    scene: SceneLike,
+    *,
+    parameters: Mapping[str, object] | None = None,
+    size: tuple[int, int] | None = None,
+    grid: int = 4,
+    variant: str = "llvm_ad_rgb",
+) -> np.ndarray:
     """Class of every pixel, from the primary hits of a regular sub-pixel grid.
 
     A pixel is *silhouette* when samples of it or of its eight neighbours mix hit and miss or several shapes,
@@ -74,14 +84,15 @@ def pixel_classes(scene, *, parameters=None, size=None, grid=4, variant="llvm_ad
         edge[a] |= differs
         edge[b] |= differs
     pixels = (shape.shape[0] // grid, grid, shape.shape[1] // grid, grid)
-    any_edge = _spread(edge.reshape(pixels).any((1, 3))) | ambiguous.reshape(pixels).any((1, 3))
+    any_edge = _spread(np.any(edge.reshape(pixels), axis=(1, 3)))
+    any_edge |= np.any(ambiguous.reshape(pixels), axis=(1, 3))
     any_hit = hit.reshape(pixels).any((1, 3))
     inner = np.where(jumps, PixelClass.MESOSTRUCTURE, PixelClass.INTERIOR)
     seen = np.where(any_hit, inner, PixelClass.BACKGROUND)
     return np.where(any_edge, PixelClass.SILHOUETTE, seen).astype(np.uint8)
 
 
-def _displaced_edges(scene, grid):
+def _displaced_edges(scene: JitArray, grid: int) -> np.ndarray | bool:
     """Pixels with a sample where a displaced material jumps, bool (H, W), or False where there is none."""
     import drjit as dr
     import mitsuba as mi
@@ -115,20 +126,20 @@ def _displaced_edges(scene, grid):
     return (spread > EDGE * largest.max(initial=0)).reshape(height, width)
 
 
-def _part(ndim, axis, part):
+def _part(ndim: int, axis: int, part: slice) -> tuple[slice, ...]:
     index = [slice(None)] * ndim
     index[axis] = part
     return tuple(index)
 
 
-def _spread(mask):
+def _spread(mask: np.ndarray) -> np.ndarray:
     """A mask grown by one pixel in all eight directions."""
     padded = np.pad(mask, 1)
     rows, columns = mask.shape
     return np.any([padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3)], axis=0)
 
 
-def _hits(scene, grid):
+def _hits(scene: JitArray, grid: int) -> list[np.ndarray]:
     """Primary hits on the fine grid.
 
     Returns

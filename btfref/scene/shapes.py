@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.sphere.frames import nearest_rotation
+from btfref.types import JitArray, PathLike
 
 #: Segments of a full turn of a tessellated sphere, disk or cylinder: chords lie within 4e-5 radii of the
 #: surface.
 SEGMENTS = 384
+
+
+#: Positions, normals, texture coordinates, faces, and the matrix to the shape's own frame.
+Tessellation = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -47,7 +53,7 @@ class BtfMaterial:
     lod_unit: float = 1.0
 
     @property
-    def rotation(self):
+    def rotation(self) -> tuple[float, float]:
         """Cosine and sine of the turn about the normal that takes local directions to the texture's frame."""
         return nearest_rotation(self.to_uv[:, :2])
 
@@ -89,7 +95,20 @@ class MeshDescription:
     bsdf: str
     to_world: np.ndarray
 
-    def corners(self):
+    @property
+    def btf(self) -> BtfMaterial:
+        """The material of a shape that has a BTF.
+
+        Raises
+        ------
+        InputError
+            When it has none.
+        """
+        if self.material is None:
+            raise InputError("a btf material is needed", field=self.name, got=self.bsdf)
+        return self.material
+
+    def corners(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Per-triangle data for shading as Mitsuba 3.9 does it.
 
         Returns
@@ -118,7 +137,7 @@ class MeshDescription:
         return p, -normals if self.flip else normals, uv, dp_du
 
 
-def neighbours(positions, faces):
+def neighbours(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Triangle across each edge, by position, so that seams of the texture do not separate.
 
     Parameters
@@ -143,7 +162,7 @@ def neighbours(positions, faces):
     return result.reshape(3, len(faces)).T
 
 
-def coordinate_system(n):
+def coordinate_system(n: np.ndarray) -> np.ndarray:
     """First tangent of Mitsuba's frame around unit vectors (Duff et al. 2017, listing 3), shape (..., 3)."""
     x, y, z = np.moveaxis(n, -1, 0)
     sign = np.copysign(1.0, z)
@@ -151,12 +170,12 @@ def coordinate_system(n):
     return np.stack([1 + sign * x * x * a, sign * x * y * a, -sign * x], -1)
 
 
-def _unit(v):
+def _unit(v: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(v, axis=-1, keepdims=True)
     return v / np.where(length > 0, length, 1.0)
 
 
-def triangles_of(shape, node, *, file):
+def triangles_of(shape: JitArray, node: JitArray, *, file: PathLike) -> dict[str, Any]:
     """Vertices of a shape, read from the instantiated mesh or tessellated.
 
     Parameters
@@ -217,7 +236,7 @@ def triangles_of(shape, node, *, file):
     }
 
 
-def _grid(n_u, n_v):
+def _grid(n_u: int, n_v: int) -> tuple[np.ndarray, np.ndarray]:
     """Corner parameters in [0, 1]² of a grid, shape ((n_v + 1)(n_u + 1), 2), and its triangles."""
     u, v = np.meshgrid(np.linspace(0, 1, n_u + 1), np.linspace(0, 1, n_v + 1))
     index = np.arange(u.size).reshape(u.shape)
@@ -226,14 +245,14 @@ def _grid(n_u, n_v):
     return np.stack([u.ravel(), v.ravel()], -1), faces
 
 
-def _without_slivers(faces, positions):
+def _without_slivers(faces: np.ndarray, positions: np.ndarray) -> np.ndarray:
     """Drop the triangles of no area, such as those at a pole."""
     p = positions[faces]
     area = np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1)
     return faces[area > 1e-12 * area.max()]
 
 
-def _rectangle(props):
+def _rectangle(props: JitArray) -> Tessellation:
     # u = (x + 1)/2, v = (y + 1)/2: rectangle.cpp of Mitsuba 3.9 (whose texture coordinate buffer says
     # otherwise).
     uv, faces = _grid(1, 1)
@@ -241,7 +260,7 @@ def _rectangle(props):
     return p, np.tile([0.0, 0.0, 1.0], (4, 1)), uv, faces, np.eye(4)
 
 
-def _sphere(props):
+def _sphere(props: JitArray) -> Tessellation:
     # u = azimuth / 2π, v = polar angle / π: sphere.cpp of Mitsuba 3.9.
     uv, faces = _grid(SEGMENTS, SEGMENTS // 2)
     phi, theta = 2 * np.pi * uv[:, 0], np.pi * uv[:, 1]
@@ -258,7 +277,7 @@ def _sphere(props):
     return p, p.copy(), uv, _without_slivers(faces[:, ::-1], p), local
 
 
-def _disk(props):
+def _disk(props: JitArray) -> Tessellation:
     # u = radius, v = azimuth / 2π: disk.cpp of Mitsuba 3.9.
     uv, faces = _grid(1, SEGMENTS)
     phi = 2 * np.pi * uv[:, 1]
@@ -266,7 +285,7 @@ def _disk(props):
     return p, np.tile([0.0, 0.0, 1.0], (len(p), 1)), uv, _without_slivers(faces, p), np.eye(4)
 
 
-def _cylinder(props):
+def _cylinder(props: JitArray) -> Tessellation:
     # u = azimuth / 2π, v along the axis: cylinder.cpp of Mitsuba 3.9.
     from mitsuba import ScalarTransform4f as Transform
     from mitsuba import coordinate_system as mitsuba_coordinate_system

@@ -8,7 +8,10 @@ integrated, not the measured samples alone, whose quadrature is exact for two ba
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref import conventions
 from btfref.errors import InputError
@@ -16,6 +19,12 @@ from btfref.numerics.sphere import harmonics, interpolation
 from btfref.numerics.sphere.quadrature import gauss_hemisphere
 from btfref.rendering.environment_light import light_set
 from btfref.representations.protocol import LitByHarmonics
+from btfref.types import PathLike
+
+if TYPE_CHECKING:
+    from btfref.representations.protocol import Representation
+    from btfref.scene.environment import Environment
+
 
 #: Bands of the paper.
 ORDER = 5
@@ -33,7 +42,9 @@ ESTIMATE = 48
 CHUNK = 1 << 11
 
 
-def shared_tables(representation, lit_by, *, file=None):
+def shared_tables(
+    representation: Representation, lit_by: Any, *, file: PathLike | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """``representation.shared_tables()`` of a method that satisfies a protocol, `LitByHarmonics` or `LitByTransfer`.
 
     Raises
@@ -55,7 +66,9 @@ def shared_tables(representation, lit_by, *, file=None):
     return representation.shared_tables()
 
 
-def environment_coefficients(environment, order, *, window=None):
+def environment_coefficients(
+    environment: Environment, order: int, *, window: str | None = None
+) -> np.ndarray:
     """Coefficients of an environment in world space.
 
     Parameters
@@ -78,7 +91,7 @@ def environment_coefficients(environment, order, *, window=None):
     return harmonics.window(window, order)[:, None] * total
 
 
-def estimated_error(environment, coefficients):
+def estimated_error(environment: Environment, coefficients: np.ndarray) -> float:
     """How differently receivers see an environment and its harmonics: see `light_set`.
 
     Parameters
@@ -99,7 +112,7 @@ def estimated_error(environment, coefficients):
     return light_set.estimated_error(node, seen, w, power)
 
 
-def light_projection(representation, order):
+def light_projection(representation: Representation, order: int) -> np.ndarray:
     """Matrix from values at the measured lights to the coefficients of what is interpolated between them.
 
     Returns
@@ -116,7 +129,9 @@ def light_projection(representation, order):
     return np.stack([np.bincount(flat, (share * y[:, None]).ravel(), n) for y in weighted.T])
 
 
-def table_coefficients(representation, order, *, file=None):
+def table_coefficients(
+    representation: Representation, order: int, *, file: PathLike | None = None
+) -> np.ndarray:
     """Coefficients of the shared tables over the light.
 
     Returns
@@ -131,7 +146,7 @@ def table_coefficients(representation, order, *, file=None):
     return found.transpose(1, 3, 0, 2, 4)
 
 
-def turn_table(order):
+def turn_table(order: int) -> np.ndarray:
     """Quarter turn about x for shaders: row i of the block of its band, float32 (order², 2 · order − 1)."""
     matrix, table = harmonics.quarter_turn(order), np.zeros((order * order, 2 * order - 1), np.float32)
     for band in range(order):
@@ -140,7 +155,14 @@ def turn_table(order):
     return table
 
 
-def radiance(representation, coefficients, light, uv, w_view, to_world):
+def radiance(
+    representation: Representation,
+    coefficients: np.ndarray,
+    light: np.ndarray,
+    uv: ArrayLike,
+    w_view: ArrayLike,
+    to_world: ArrayLike,
+) -> np.ndarray:
     """⟨b, M a⟩ in float64.
 
     Parameters
@@ -155,7 +177,7 @@ def radiance(representation, coefficients, light, uv, w_view, to_world):
     ndarray of float64, shape (N, 3)
     """
     order = int(np.sqrt(len(light)))
-    _, cluster, weights = representation.shared_tables()
+    _, cluster, weights = shared_tables(representation, LitByHarmonics)
     meta = representation.meta
     views = interpolation.from_arrays(representation.arrays(), "view")
     uv, w_view, to_world = (np.asarray(a, float) for a in (uv, w_view, to_world))

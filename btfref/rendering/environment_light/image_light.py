@@ -12,17 +12,34 @@ A class a method, found by the registry: ``SHADER`` provides ``btf_environment``
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref import conventions
 from btfref.numerics.powers import FLOOR, safe_power
 from btfref.numerics.sphere import interpolation
 from btfref.rendering.environment_light import prefilter
 from btfref.rendering.environment_light.split_light import split_light, unsplit
+from btfref.representations.analytic import lafortune, rf_lobes, rf_poly
 from btfref.representations.analytic.lafortune import flat_maps
 from btfref.representations.analytic.light_functions import held
 from btfref.representations.analytic.rf_lobes import parabolic_axis
 from btfref.representations.lookup import CHUNK
+
+if TYPE_CHECKING:
+    from btfref.rendering.environment_light.split_light import Cells, SplitLight
+    from btfref.representations.protocol import Representation
+    from btfref.scene.environment import Environment
+
+
+#: Indices and weights of what an interpolation reads, each of shape (N, k).
+Stencil = tuple[np.ndarray, np.ndarray]
+
+#: ``kernel(texel, view, w_view, frame)``: radiance at some points, shape (N, 3).
+Kernel = Callable[[Stencil, Stencil, np.ndarray, np.ndarray], np.ndarray]
 
 
 class _PrefilteredLobes:
@@ -32,13 +49,20 @@ class _PrefilteredLobes:
     cosine = False
 
     @classmethod
-    def split(cls, representation, environment):
+    def split(cls, representation: Representation, environment: Environment) -> SplitLight:
         """What is filtered and what becomes lights: a `SplitLight`."""
         edge = representation.meta["constants"]["light_edge"]
         return split_light(environment, edge, cosine=cls.cosine)
 
     @classmethod
-    def tables(cls, representation, environment, *, size=prefilter.SIZE, slices=prefilter.SLICES):
+    def tables(
+        cls,
+        representation: Representation,
+        environment: Environment | Cells,
+        *,
+        size: int = prefilter.SIZE,
+        slices: int = prefilter.SLICES,
+    ) -> dict[str, np.ndarray]:
         """Maps of the environment.
 
         Parameters
@@ -68,14 +92,21 @@ class Lobes(_PrefilteredLobes):
     SHADER = "environment/rf_lobes.glsl"
 
     @classmethod
-    def radiance(cls, representation, tables, uv, w_view, to_world):
+    def radiance(
+        cls,
+        representation: rf_lobes.Representation,
+        tables: Mapping[str, np.ndarray],
+        uv: ArrayLike,
+        w_view: ArrayLike,
+        to_world: ArrayLike,
+    ) -> np.ndarray:
         """See :func:`radiance`."""
         lobes = representation.maps["lobes"]
         lobes = lobes.reshape(-1, lobes.shape[2], lobes.shape[3] // 4, 4)
         colour = representation.maps["colour"].reshape(-1, 4).astype(float)
         maps, clipped = tables["environment_maps"], tables["clipped_lobes"]
 
-        def kernel(texel, view, w_view, frame):
+        def kernel(texel: Stencil, view: Stencil, w_view: np.ndarray, frame: np.ndarray) -> np.ndarray:
             at = lobes[texel[0][:, :, None], view[0][:, None, :]].astype(float)
             s, t, exponent, peak = np.moveaxis(at, -1, 0)
             axis, to_world = parabolic_axis(s, t), frame[:, None, None, None]
@@ -97,13 +128,20 @@ class Lafortune(_PrefilteredLobes):
     cosine = True
 
     @classmethod
-    def radiance(cls, representation, tables, uv, w_view, to_world):
+    def radiance(
+        cls,
+        representation: lafortune.Representation,
+        tables: Mapping[str, np.ndarray],
+        uv: ArrayLike,
+        w_view: ArrayLike,
+        to_world: ArrayLike,
+    ) -> np.ndarray:
         """See :func:`radiance`."""
         flat = flat_maps(representation.maps)
         maps, clipped = tables["environment_maps"], tables["clipped_lobes"]
         edge = representation.meta["constants"]["view_edge"]
 
-        def kernel(texel, view, w_view, frame):
+        def kernel(texel: Stencil, view: Stencil, w_view: np.ndarray, frame: np.ndarray) -> np.ndarray:
             lobes = flat["lobes"][texel[0]]
             t = lobes[..., :3] * held(w_view, edge)[0][:, None, None]
             size, exponent = np.linalg.norm(t, axis=-1), lobes[..., 3]
@@ -126,25 +164,34 @@ class Polynomials:
     SHADER = "environment/rf_poly.glsl"
 
     @classmethod
-    def split(cls, representation, environment):
+    def split(cls, representation: Representation, environment: Environment) -> SplitLight:
         """Nothing is taken out: moments hold small lights as well as broad ones."""
         return unsplit(environment)
 
     @classmethod
-    def tables(cls, representation, environment, *, size=prefilter.SIZE):
+    def tables(
+        cls, representation: Representation, environment: Environment | Cells, *, size: int = prefilter.SIZE
+    ) -> dict[str, np.ndarray]:
         """``environment_moments`` [18, size, size, 3]; see :func:`prefilter.moment_maps`."""
         edge = representation.meta["constants"]["light_edge"]
         return {"environment_moments": prefilter.moment_maps(environment, edge, size=size)}
 
     @classmethod
-    def radiance(cls, representation, tables, uv, w_view, to_world):
+    def radiance(
+        cls,
+        representation: rf_poly.Representation,
+        tables: Mapping[str, np.ndarray],
+        uv: ArrayLike,
+        w_view: ArrayLike,
+        to_world: ArrayLike,
+    ) -> np.ndarray:
         """See :func:`radiance`."""
         polynomial = representation.maps["polynomial"]
         polynomial = polynomial.reshape(-1, *polynomial.shape[2:])
         chroma = representation.maps["chroma"].reshape(-1, 3).astype(float)
         maps = tables["environment_moments"]
 
-        def kernel(texel, view, w_view, frame):
+        def kernel(texel: Stencil, view: Stencil, w_view: np.ndarray, frame: np.ndarray) -> np.ndarray:
             xx, yy, zz, xy, xz, yz, x, y, z = (
                 prefilter.map_lookup(maps, np.full(len(frame), i), frame[:, :, 2]) for i in range(9)
             )
@@ -162,7 +209,13 @@ class Polynomials:
         return _evaluated(representation, kernel, uv, w_view, to_world)
 
 
-def radiance(representation, tables, uv, w_view, to_world):
+def radiance(
+    representation: Representation,
+    tables: Mapping[str, np.ndarray],
+    uv: ArrayLike,
+    w_view: ArrayLike,
+    to_world: ArrayLike,
+) -> np.ndarray:
     """Radiance towards the viewer under the environment that ``tables`` hold, without the lights taken out of it.
 
     Parameters
@@ -192,12 +245,14 @@ def radiance(representation, tables, uv, w_view, to_world):
     return image_light(representation.meta["method"]).radiance(representation, tables, uv, w_view, to_world)
 
 
-def _irradiance(maps, frame):
+def _irradiance(maps: np.ndarray, frame: np.ndarray) -> np.ndarray:
     """The first slice is the cosine."""
     return np.pi * prefilter.map_lookup(maps, np.zeros(len(frame), int), frame[:, :, 2])
 
 
-def _evaluated(representation, kernel, uv, w_view, to_world):
+def _evaluated(
+    representation: Representation, kernel: Kernel, uv: ArrayLike, w_view: ArrayLike, to_world: ArrayLike
+) -> np.ndarray:
     """Stencils, validity and bounded memory around a method's kernel."""
     meta = representation.meta
     views = interpolation.from_arrays(representation.arrays(), "view")

@@ -10,11 +10,16 @@ smooth receiver.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.conventions import LUMINANCE
 from btfref.errors import InputError
+
+if TYPE_CHECKING:
+    from btfref.scene.environment import Environment
+
 
 #: Estimated relative error at which the search for a number of lights ends.
 TARGET = 0.01
@@ -52,19 +57,19 @@ class LightSet:
 
     w: np.ndarray
     power: np.ndarray
-    error: float
+    error: float | None
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.w)
 
-    def table(self):
+    def table(self) -> np.ndarray:
         """For ``shaders/lib/light/environment_lights.glsl``: direction, then power; float32 (n ≥ 1, 2, 4)."""
         table = np.zeros((max(len(self), 1), 2, 4), np.float32)
         table[: len(self), 0, :3], table[: len(self), 1, :3] = self.w, self.power
         return table
 
 
-def light_set(environment, *, lights=None, target=TARGET):
+def light_set(environment: Environment, *, lights: int | None = None, target: float = TARGET) -> LightSet:
     """Lights that stand for an environment.
 
     Parameters
@@ -94,15 +99,15 @@ def light_set(environment, *, lights=None, target=TARGET):
     w, power = w[lit], power[lit]
     n = FEWEST if lights is None else lights
     while True:
-        found = divided(w, power, n)
-        found = LightSet(*found, estimated_error(*found, w, power))
+        directions, powers = divided(w, power, n)
+        error = estimated_error(directions, powers, w, power)
         # More lights than lit cells do not exist.
-        if lights is not None or found.error <= target or n >= MOST or len(found) >= len(w):
-            return found
+        if lights is not None or error <= target or n >= MOST or len(directions) >= len(w):
+            return LightSet(directions, powers, error)
         n *= 2
 
 
-def divided(w, power, n):
+def divided(w: np.ndarray, power: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Directions and powers of at most ``n`` lights that stand for the cells (w, power), some of them lit."""
     weight = power @ LUMINANCE
     # What has colour has luminance; the floor keeps cells of faint blue.
@@ -129,7 +134,9 @@ def divided(w, power, n):
     return _settled(w, power, weight, label, count)
 
 
-def _settled(w, power, weight, label, count):
+def _settled(
+    w: np.ndarray, power: np.ndarray, weight: np.ndarray, label: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Lloyd's iterations from a division; lights without cells are left out."""
     from scipy.spatial import cKDTree
 
@@ -148,12 +155,12 @@ def _settled(w, power, weight, label, count):
     return centre, _sums(label, np.ones(len(w)), power, count)
 
 
-def _sums(label, weight, values, count):
+def _sums(label: np.ndarray, weight: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
     """Weighted sums of rows by label, shape (count, k)."""
     return np.stack([np.bincount(label, weight * column, count) for column in values.T], 1)
 
 
-def estimated_error(w, power, cell_w, cell_power):
+def estimated_error(w: np.ndarray, power: np.ndarray, cell_w: np.ndarray, cell_power: np.ndarray) -> float:
     """How differently receivers see the lights and the cells that they stand for.
 
     Parameters
@@ -175,7 +182,7 @@ def estimated_error(w, power, cell_w, cell_power):
     axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
     axis *= np.where(np.einsum("ni,ni->n", axis, normal) < 0, -1, 1)[:, None]
 
-    def seen(w, power):
+    def seen(w: np.ndarray, power: np.ndarray) -> np.ndarray:
         w, luminance = w.astype(np.float32), (power @ LUMINANCE).astype(np.float32)
         cosine = np.maximum(normal.astype(np.float32) @ w.T, 0)
         lobe = np.maximum(axis.astype(np.float32) @ w.T, 0)

@@ -8,8 +8,9 @@ where texels share tables over lights. A way that is made ready for a representa
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import cached_property
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -18,14 +19,25 @@ from btfref.numerics.sphere import harmonics
 from btfref.registry import image_light, methods
 from btfref.rendering.environment_light import PATHS, harmonic_light, transfer_light
 from btfref.rendering.environment_light.light_set import light_set
+from btfref.rendering.environment_light.prepared import Evaluate, Place, Prepared, Radiance, lit
 from btfref.rendering.environment_light.transfer import (
     TransferSettings,
     clustered,
     corner_matrices,
     vertex_transfer,
 )
+from btfref.representations.protocol import LitByHarmonics, LitByTransfer
 from btfref.scene.environment import constant
 from btfref.scene.shapes import neighbours
+from btfref.types import Facts, PathLike
+
+if TYPE_CHECKING:
+    from btfref.rendering.environment_light.light_set import LightSet
+    from btfref.representations.protocol import Representation
+    from btfref.scene.description import SceneDescription
+    from btfref.scene.environment import Environment
+    from btfref.scene.shapes import MeshDescription
+
 
 #: Lookups whose mean is the albedo of a material.
 ALBEDO_SAMPLES = 512
@@ -36,49 +48,10 @@ PASS = 32
 
 #: Environments whose lights are kept for the next picture: two renderers ask for the same ones.
 KEPT = 4
-_LIGHTINGS = {}
-
-#: Values of B evaluated at a time in float64.
-BLOCK = 1 << 18
+_LIGHTINGS: dict[Hashable, Lighting] = {}
 
 
-@dataclass(frozen=True)
-class Prepared:
-    """A way, ready for one representation.
-
-    Parameters
-    ----------
-    path : str
-        Its name.
-    shader : str
-        GLSL file with ``btf_environment``.
-    tables : dict of str to ndarray
-        That the file reads, beside the representation's own.
-    radiance : callable
-        ``(uv (N, 2), w_view (N, 3), to_world (N, 3, 3), evaluate=None, place=None) -> (N, 3)`` in float64.
-        ``evaluate(uv, w_light, w_view, point)`` stands for the representation's own where points have levels of detail:
-        ``point`` are their indices. ``place()`` gives triangles (N,) and barycentric coordinates (N, 3).
-    facts : dict
-        JSON-able: for the picture's ``meta``.
-    constants : dict
-        Of the GLSL file.
-    passes : tuple of dict
-        Uniforms of pictures that add up; one, without any, where a single picture does.
-    bins : ndarray of int, shape (n + 1,), or None
-        Where the triangles of each pass begin in the table ``bin_triangles``; None: all are drawn.
-    transfer : btfref.rendering.environment_light.transfer_light.TransferLight or None
-        What can be lit anew.
-    """
-
-    path: str
-    shader: str
-    tables: dict
-    radiance: object
-    facts: dict = field(default_factory=dict)
-    constants: dict = field(default_factory=dict)
-    passes: tuple = ({},)
-    bins: np.ndarray | None = None
-    transfer: object = None
+T = TypeVar("T")
 
 
 class Lighting:
@@ -109,16 +82,16 @@ class Lighting:
 
     def __init__(
         self,
-        environment,
-        path="auto",
+        environment: Environment,
+        path: str = "auto",
         *,
-        lights=None,
-        order=harmonic_light.ORDER,
-        window=None,
-        meshes=(),
-        delta=False,
-        transfer=None,
-    ):
+        lights: int | None = None,
+        order: int = harmonic_light.ORDER,
+        window: str | None = None,
+        meshes: Sequence[MeshDescription] = (),
+        delta: bool = False,
+        transfer: TransferSettings | None = None,
+    ) -> None:
         if path not in PATHS:
             raise InputError(
                 "unknown way to light", field="environment", got=repr(path), expected=", ".join(PATHS)
@@ -129,30 +102,30 @@ class Lighting:
         self._order, self._window = harmonics.checked_order(order), window
         harmonics.window(window, order)
         self._meshes, self._transfer = tuple(meshes), transfer or TransferSettings()
-        self._made = {}
+        self._made: dict[Hashable, Prepared] = {}
         self._delta = delta
 
     @cached_property
-    def light_set(self):
+    def light_set(self) -> LightSet:
         """The lights that stand for the environment."""
         return light_set(self.environment, lights=self._count)
 
     @cached_property
-    def coefficients(self):
+    def coefficients(self) -> np.ndarray:
         """The environment in spherical harmonics, world space, shape (order², 3)."""
         return self.coefficients_of(self.environment)
 
-    def coefficients_of(self, environment):
+    def coefficients_of(self, environment: Environment) -> np.ndarray:
         """Another environment, likewise."""
         return harmonic_light.environment_coefficients(environment, self._order, window=self._window)
 
     @property
-    def per_mesh(self):
+    def per_mesh(self) -> bool:
         """Whether every mesh is prepared on its own."""
         return self.path == "transfer"
 
     @cached_property
-    def _vertex_transfer(self):
+    def _vertex_transfer(self) -> list[np.ndarray] | None:
         """Of all meshes, or None where nothing hides the environment."""
         settings = self._transfer
         if not settings.shadows:
@@ -160,20 +133,22 @@ class Lighting:
         albedo = [self._albedo(mesh) for mesh in self._meshes] if settings.bounces else ()
         return vertex_transfer(self._meshes, self._order, bounces=settings.bounces, albedo=albedo)
 
-    def _albedo(self, mesh):
+    def _albedo(self, mesh: MeshDescription) -> np.ndarray:
         """Mean colour of a material under radiance 1, over texels and views, shape (3,)."""
         from btfref import representations
 
-        rep = representations.load(mesh.material.filename)
+        rep = representations.load(mesh.btf.filename)
         rng = np.random.default_rng(0)
         uv, w_view = rng.random((ALBEDO_SAMPLES, 2)), rng.normal(size=(ALBEDO_SAMPLES, 3))
         w_view[:, 2] = np.abs(w_view[:, 2]) + 0.1
         w_view /= np.linalg.norm(w_view, axis=1, keepdims=True)
         frame = np.broadcast_to(np.eye(3), (ALBEDO_SAMPLES, 3, 3))
         white = Lighting(constant(), "sh", order=1).prepared(rep)
-        return mesh.material.scale * white.radiance(uv, w_view, frame).mean(0)
+        return mesh.btf.scale * white.radiance(uv, w_view, frame).mean(0)
 
-    def prepared(self, representation, *, file=None, mesh=None):
+    def prepared(
+        self, representation: Representation, *, file: PathLike | None = None, mesh: int | None = None
+    ) -> Prepared:
         """The way for a representation.
 
         Parameters
@@ -199,32 +174,47 @@ class Lighting:
             prefiltered = methods()[key].image_light if key in methods() else ""
             path = "prefiltered" if prefiltered and self._count is None else "lights"
         if path == "transfer":
+            assert mesh is not None, "each mesh is prepared on its own"
             return self._by_transfer(representation, file, mesh)
         content = (path, *_content(representation.arrays(), representation.meta))
         return _remembered(self._made, content, lambda: getattr(self, f"_by_{path}")(representation, file), 1)
 
-    def _by_prefiltered(self, representation, file):
+    def _by_prefiltered(self, representation: Representation, file: PathLike | None) -> Prepared:
         light = image_light(representation.meta["method"], file=file)
         split = light.split(representation, self.environment)
         tables = light.tables(representation, split.rest)
 
-        def radiance(uv, w_view, to_world, evaluate=None, place=None):
+        def radiance(
+            uv: np.ndarray,
+            w_view: np.ndarray,
+            to_world: np.ndarray,
+            evaluate: Evaluate | None = None,
+            place: Place | None = None,
+        ) -> np.ndarray:
             filtered = light.radiance(representation, tables, uv, w_view, to_world)
             return filtered + lit(representation, split.lights, uv, w_view, to_world, evaluate)
 
         return self._with_lights("prefiltered", light.SHADER, tables, radiance, split.lights)
 
-    def _by_lights(self, representation, file):
+    def _by_lights(self, representation: Representation, file: PathLike | None) -> Prepared:
         found = self.light_set
 
-        def radiance(uv, w_view, to_world, evaluate=None, place=None):
+        def radiance(
+            uv: np.ndarray,
+            w_view: np.ndarray,
+            to_world: np.ndarray,
+            evaluate: Evaluate | None = None,
+            place: Place | None = None,
+        ) -> np.ndarray:
             return lit(representation, found, uv, w_view, to_world, evaluate)
 
         return self._with_lights("lights", "environment/lights.glsl", {}, radiance, found)
 
-    def _with_lights(self, path, shader, tables, radiance, found):
+    def _with_lights(
+        self, path: str, shader: str, tables: dict[str, np.ndarray], radiance: Radiance, found: LightSet
+    ) -> Prepared:
         """A way that has directional lights, a few a pass."""
-        facts = {"environment_lights": len(found)}
+        facts: Facts = {"environment_lights": len(found)}
         if found.error is not None:
             facts["estimated_error"] = found.error
         tables = {**tables, "environment_lights": found.table()}
@@ -234,12 +224,18 @@ class Lighting:
         )
         return Prepared(path, shader, tables, radiance, facts, passes=passes)
 
-    def _by_sh(self, representation, file):
+    def _by_sh(self, representation: Representation, file: PathLike | None) -> Prepared:
         order, light = self._order, self.coefficients
         found = harmonic_light.table_coefficients(representation, order, file=file)
         stored = found.astype(np.float32)
 
-        def radiance(uv, w_view, to_world, evaluate=None, place=None):
+        def radiance(
+            uv: np.ndarray,
+            w_view: np.ndarray,
+            to_world: np.ndarray,
+            evaluate: Evaluate | None = None,
+            place: Place | None = None,
+        ) -> np.ndarray:
             return harmonic_light.radiance(representation, stored, light, uv, w_view, to_world)
 
         tables = {
@@ -253,16 +249,17 @@ class Lighting:
             "ringing": harmonics.ringing(light, order),
             "estimated_error": harmonic_light.estimated_error(self.environment, light),
         }
+        assert isinstance(representation, LitByHarmonics)
         shader = representation.harmonic_shader
         return Prepared("sh", shader, tables, radiance, facts, {"HARMONIC_ORDER": order})
 
-    def _by_transfer(self, representation, file, number):
+    def _by_transfer(self, representation: Representation, file: PathLike | None, number: int) -> Prepared:
         mesh, settings, order = self._meshes[number], self._transfer, self._order
         material = transfer_light.Material(representation, order, map_size=settings.map_size, file=file)
         vertices = self._vertex_transfer
         matrices = corner_matrices(mesh, order, None if vertices is None else vertices[number])
         transfer = clustered(matrices, settings)
-        two_sided = mesh.material.twosided
+        two_sided = mesh.btf.twosided
         light = transfer_light.TransferLight(
             material, transfer, self.coefficients, two_sided=two_sided, bits=settings.bits
         )
@@ -275,7 +272,14 @@ class Lighting:
             triangles, starts = np.concatenate([triangles, every]), np.append(starts, starts[-1] + len(every))
             bin_numbers.append(-1)
 
-        def radiance(uv, w_view, to_world, evaluate=None, place=None):
+        def radiance(
+            uv: np.ndarray,
+            w_view: np.ndarray,
+            to_world: np.ndarray,
+            evaluate: Evaluate | None = None,
+            place: Place | None = None,
+        ) -> np.ndarray:
+            assert place is not None
             return light.radiance(uv, w_view, np.linalg.det(to_world) < 0, *place())
 
         tables = {
@@ -308,6 +312,7 @@ class Lighting:
             "TRANSFER_CLUSTERS": len(transfer.basis),
             "TRANSFER_MATERIALS": len(material.present),
         }
+        assert isinstance(representation, LitByTransfer)
         shader = representation.transfer_shader
         passes = tuple(
             {"bin": k, "bin_first": int(first)} for k, first in zip(bin_numbers, starts[:-1], strict=True)
@@ -315,41 +320,7 @@ class Lighting:
         return Prepared("transfer", shader, tables, radiance, facts, constants, passes, starts, light)
 
 
-def lit(representation, found, uv, w_view, to_world, evaluate=None):
-    """Radiance under directional lights in float64, as ``shaders/lib/light/environment_lights.glsl`` sums it.
-
-    Parameters
-    ----------
-    representation : Representation
-    found : btfref.rendering.environment_light.light_set.LightSet
-    uv : array_like, shape (N, 2)
-    w_view : array_like, shape (N, 3)
-        Local frame.
-    to_world : array_like, shape (N, 3, 3)
-        Columns: the local axes in world space.
-    evaluate : callable, optional
-        In place of the representation's own: see :class:`Prepared`.
-
-    Returns
-    -------
-    ndarray of float64, shape (N, 3)
-    """
-    evaluate = evaluate or (lambda uv, w_light, w_view, _: representation.evaluate(uv, w_light, w_view))
-    uv, w_view, to_world = (np.asarray(a, float) for a in (uv, w_view, to_world))
-    result = np.zeros((len(uv), 3))
-    step = max(1, BLOCK // max(len(found), 1))
-    for first in range(0, len(uv) if len(found) else 0, step):
-        part = slice(first, first + step)
-        w_light = np.einsum("li,nij->nlj", found.w, to_world[part])
-        point, light = np.nonzero(w_light[..., 2] > 0)
-        at = first + point
-        value = evaluate(uv[at], w_light[point, light], w_view[at], at) * found.power[light]
-        for k in range(3):
-            result[part, k] = np.bincount(point, value[:, k], minlength=len(w_light))
-    return result
-
-
-def lighting_of(scene, path="auto", **options):
+def lighting_of(scene: SceneDescription, path: str = "auto", **options: Any) -> Lighting | None:
     """The :class:`Lighting` of a scene's environment, or None without one.
 
     Parameters
@@ -359,21 +330,22 @@ def lighting_of(scene, path="auto", **options):
     **options
         Of :class:`Lighting`; None leaves the default.
     """
-    if scene.environment is None:
+    environment = scene.environment
+    if environment is None:
         return None
     given = {k: v for k, v in options.items() if v is not None}
     if path == "transfer":
         delta = bool(scene.lights)
-        return Lighting(scene.environment, path, meshes=scene.meshes, delta=delta, **given)
+        return Lighting(environment, path, meshes=scene.meshes, delta=delta, **given)
     content = (
         path,
         repr(sorted(given.items(), key=lambda item: item[0])),
-        *_content(vars(scene.environment)),
+        *_content(vars(environment)),
     )
-    return _remembered(_LIGHTINGS, content, lambda: Lighting(scene.environment, path, **given), KEPT)
+    return _remembered(_LIGHTINGS, content, lambda: Lighting(environment, path, **given), KEPT)
 
 
-def _remembered(store, key, make, most):
+def _remembered(store: dict[Any, T], key: Hashable, make: Callable[[], T], most: int) -> T:
     """What was made under a key; of old ones ``most`` are kept."""
     if key not in store:
         made = make()
@@ -383,7 +355,7 @@ def _remembered(store, key, make, most):
     return store[key]
 
 
-def _content(*values):
+def _content(*values: Mapping[str, Any]) -> tuple[str, ...]:
     """Keys of what dictionaries of arrays and facts hold, by content."""
     digests = []
     for value in values:
@@ -392,8 +364,8 @@ def _content(*values):
             entry = value[name]
             if isinstance(entry, np.ndarray):
                 digest.update(f"{name} {entry.dtype} {entry.shape} ".encode())
-                digest.update(np.ascontiguousarray(entry))
+                digest.update(np.ascontiguousarray(entry).data)
             else:
                 digest.update(f"{name} {entry!r} ".encode())
         digests.append(digest.hexdigest())
-    return digests
+    return tuple(digests)

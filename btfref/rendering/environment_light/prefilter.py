@@ -12,11 +12,17 @@ so that bilinear lookups are continuous across the seam.
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.numerics.powers import FLOOR
 from btfref.numerics.sphere.parabolic import bilinear_stencil, square_to_hemisphere, texel_centres
+
+if TYPE_CHECKING:
+    from btfref.rendering.environment_light.split_light import Cells
+    from btfref.scene.environment import Environment
+
 
 #: Sampled exponents of the paper: 2^(i/2), i = 0 … 10.
 SLICES = 11
@@ -38,18 +44,18 @@ HEIGHTS = 128
 SMALLEST = 1.5e-154
 
 
-def exponents(slices=SLICES):
+def exponents(slices: int = SLICES) -> np.ndarray:
     """The sampled exponents ``2^(i/2)``, shape (slices,)."""
     return 2.0 ** (np.arange(slices) / 2)
 
 
-def map_directions(size=SIZE):
+def map_directions(size: int = SIZE) -> np.ndarray:
     """Directions of the texels of a map over the sphere, shape (2, size, size, 3)."""
     upper = square_to_hemisphere(texel_centres(size) * (size / (size - 1)))
     return np.stack([upper, upper * [1, 1, -1]])
 
 
-def lobe_maps(environment, *, size=SIZE, slices=SLICES):
+def lobe_maps(environment: Environment | Cells, *, size: int = SIZE, slices: int = SLICES) -> np.ndarray:
     """The environment as cosine lobes see it.
 
     Parameters
@@ -89,7 +95,7 @@ def lobe_maps(environment, *, size=SIZE, slices=SLICES):
     return result.reshape(2 * slices, size, size, 3)
 
 
-def moment_maps(environment, edge, *, size=SIZE):
+def moment_maps(environment: Environment | Cells, edge: float, *, size: int = SIZE) -> np.ndarray:
     """Moments of the light over the hemisphere about any normal, as a polynomial of the light needs them.
 
     Lights are held at the outermost measured cosine and fade below it, about that normal: see
@@ -143,7 +149,7 @@ def moment_maps(environment, edge, *, size=SIZE):
 
 
 @lru_cache(maxsize=8)
-def clipped_lobes(edge, *, cosine, slices=CLIPPED, heights=HEIGHTS):
+def clipped_lobes(edge: float, *, cosine: bool, slices: int = CLIPPED, heights: int = HEIGHTS) -> np.ndarray:
     """The cosine lobes that stand for lobes cut by the horizon, where lights near it fade.
 
     A lobe about an axis ``a`` loses what is below the surface's horizon. What is left is taken as a share of a whole
@@ -171,12 +177,12 @@ def clipped_lobes(edge, *, cosine, slices=CLIPPED, heights=HEIGHTS):
     # steps in the azimuth.
     border = np.arccos(edge)
     pieces = [(0.0, border, 128), (border, np.pi / 2, 32)] if edge > 0 else [(0.0, np.pi / 2, 160)]
-    theta, weight = [], []
+    angles, shares = [], []
     for low, high, count in pieces:
         nodes, weights = np.polynomial.legendre.leggauss(count)
-        theta.append(low + (high - low) * (nodes + 1) / 2)
-        weight.append((high - low) / 2 * weights)
-    theta, weight = np.concatenate(theta), np.concatenate(weight)
+        angles.append(low + (high - low) * (nodes + 1) / 2)
+        shares.append((high - low) / 2 * weights)
+    theta, weight = np.concatenate(angles), np.concatenate(shares)
     z, weight = np.cos(theta), weight * np.sin(theta)
     phi = (np.arange(256) + 0.5) * (np.pi / 256)
     held = np.maximum(z, edge)
@@ -215,7 +221,7 @@ def clipped_lobes(edge, *, cosine, slices=CLIPPED, heights=HEIGHTS):
     return result
 
 
-def map_lookup(maps, index, w):
+def map_lookup(maps: np.ndarray, index: np.ndarray, w: np.ndarray) -> np.ndarray:
     """Bilinear lookup in one of several maps over the sphere, as ``shaders/lib/light/sphere_maps.glsl`` does it.
 
     Parameters
@@ -239,7 +245,9 @@ def map_lookup(maps, index, w):
     return np.einsum("...k,...kc->...c", weight, flat[half[..., None], at].astype(float))
 
 
-def lobe_lookup(maps, clipped, axis, to_world, exponent):
+def lobe_lookup(
+    maps: np.ndarray, clipped: np.ndarray, axis: np.ndarray, to_world: np.ndarray, exponent: np.ndarray
+) -> np.ndarray:
     """Integral of ``max(a · l, 0)^n`` times the environment over the hemisphere of a surface.
 
     Parameters
@@ -269,7 +277,7 @@ def lobe_lookup(maps, clipped, axis, to_world, exponent):
     return (2 * np.pi / (exponent + 1) * share)[..., None] * mean
 
 
-def clipped_lobe(clipped, height, exponent):
+def clipped_lobe(clipped: np.ndarray, height: np.ndarray, exponent: np.ndarray) -> np.ndarray:
     """The columns of :func:`clipped_lobes` for any height of the axis and any exponent, shape (...) -> (4, ...)."""
     low, f = between(2 * np.log2(np.maximum(exponent, 1)), len(clipped))
     f = f[..., None]
@@ -277,14 +285,14 @@ def clipped_lobe(clipped, height, exponent):
     return np.moveaxis(columns, -1, 0)
 
 
-def clipped_lookup(clipped, index, height):
+def clipped_lookup(clipped: np.ndarray, index: np.ndarray, height: np.ndarray) -> np.ndarray:
     """Linear lookup in a row of a table of :func:`clipped_lobes`, shape (...) -> (..., 4)."""
     low, f = between((height + 1) * ((clipped.shape[1] - 1) / 2), clipped.shape[1])
     f = f[..., None]
     return (1 - f) * clipped[index, low].astype(float) + f * clipped[index, low + 1].astype(float)
 
 
-def between(position, count):
+def between(position: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """The lower of two of ``count`` samples about a position, held at the ends, and the share of the upper one."""
     position = np.clip(position, 0, count - 1)
     low = np.minimum(position.astype(np.int64), count - 2)

@@ -11,6 +11,7 @@ cell's power is what stays plus what is taken.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +19,10 @@ from btfref.conventions import LUMINANCE
 from btfref.rendering.environment_light import prefilter
 from btfref.rendering.environment_light.light_set import LightSet, divided
 from btfref.scene.environment import cell_angles
+
+if TYPE_CHECKING:
+    from btfref.scene.environment import Environment
+
 
 #: Estimated relative error at which the search ends: half of what an image may be off.
 TARGET = 0.02
@@ -50,7 +55,7 @@ class Cells:
     w: np.ndarray
     power: np.ndarray
 
-    def cells(self):
+    def cells(self) -> tuple[np.ndarray, np.ndarray]:
         """``w`` and ``power``."""
         return self.w, self.power
 
@@ -71,7 +76,9 @@ class SplitLight:
     lights: LightSet
 
 
-def split_light(environment, edge, *, cosine, target=TARGET, most=MOST):
+def split_light(
+    environment: Environment, edge: float, *, cosine: bool, target: float = TARGET, most: int = MOST
+) -> SplitLight:
     """Take out of an environment what prefiltered lobes cannot show.
 
     Parameters
@@ -104,7 +111,7 @@ def split_light(environment, edge, *, cosine, target=TARGET, most=MOST):
     true, shown = receivers.seen(w[lit], (luminance[:, None] * kept)[lit])
     truth = true[:, 0]
 
-    def error(difference):
+    def error(difference: np.ndarray) -> float:
         return float(np.sqrt(np.mean(difference**2)) / max(truth.mean(), 1e-300))
 
     errors = [error(d) for d in (shown - true).T]
@@ -125,15 +132,15 @@ def split_light(environment, edge, *, cosine, target=TARGET, most=MOST):
         n *= 2
 
 
-def unsplit(environment):
+def unsplit(environment: Environment) -> SplitLight:
     """All of an environment is filtered; no error is estimated."""
     return SplitLight(Cells(*environment.cells()), LightSet(np.zeros((0, 3)), np.zeros((0, 3)), None))
 
 
-def _kept(radiance, mean):
+def _kept(radiance: np.ndarray, mean: float) -> np.ndarray:
     """Share of each cell that stays for each threshold, shape (n, levels); everything stays at the first."""
-    thresholds = [np.inf, *radiance.max() * 0.5 ** np.arange(1, OCTAVES)]
-    thresholds = np.array([t for t in thresholds if t > mean])
+    thresholds = np.array([np.inf, *radiance.max() * 0.5 ** np.arange(1, OCTAVES)])
+    thresholds = thresholds[thresholds > mean]
     return np.minimum(1, thresholds / np.maximum(radiance, 1e-30)[:, None])
 
 
@@ -143,7 +150,7 @@ class _Receivers:
     The maps' own resolution is left out: it is a tenth of what the horizon costs.
     """
 
-    def __init__(self, edge, cosine):
+    def __init__(self, edge: float, cosine: bool) -> None:
         rng = np.random.default_rng(0)
         normal, axis = rng.normal(size=(2, RECEIVERS, 3))
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -161,7 +168,7 @@ class _Receivers:
         self.low, self.between = prefilter.between(position, prefilter.SLICES)
         self.share = share
 
-    def seen(self, w, luminance):
+    def seen(self, w: np.ndarray, luminance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What receivers see of lights, and what maps show of them; (n, 3), (n, k) -> two of (RECEIVERS, k)."""
         true, shown = np.zeros((2, RECEIVERS, luminance.shape[1]))
         single = [a.astype(np.float32) for a in (self.normal, self.axis, self.moved)]
@@ -182,7 +189,7 @@ class _Receivers:
                 shown[...] += lambert + self.share[:, None] / 2 * mean
         return true, shown
 
-    def _lobe(self, z, along):
+    def _lobe(self, z: np.ndarray, along: np.ndarray) -> np.ndarray:
         """Lobes of lights at heights ``z`` above the receivers' horizons, held and faded below the edge."""
         radius = np.sqrt(max(1 - self.edge**2, 0))
         below = z < self.edge

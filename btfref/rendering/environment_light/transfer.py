@@ -9,15 +9,23 @@ triangle.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.errors import InputError
 from btfref.numerics.solvers.clustering import leading_axes, local_pca
 from btfref.numerics.solvers.lowrank import range_basis
 from btfref.numerics.sphere import harmonics
 from btfref.scene.hits import corner_frames
+from btfref.types import JitArray, Progress
+
+if TYPE_CHECKING:
+    from btfref.scene.shapes import MeshDescription
+
 
 #: Rays from a vertex that find what hides the environment: 1024 make steps of 6 degrees, five bands have lobes of 45.
 RAYS = 1024
@@ -60,7 +68,7 @@ class TransferSettings:
     map_size: int = 16
     seed: int = 0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, least in (("clusters", 1), ("components", 1), ("bounces", 0), ("map_size", 2)):
             if not isinstance(getattr(self, name), int) or getattr(self, name) < least:
                 raise InputError(
@@ -99,7 +107,7 @@ class ClusteredTransfer:
     error: float
 
 
-def corner_matrices(mesh, order, transfer=None):
+def corner_matrices(mesh: MeshDescription, order: int, transfer: np.ndarray | None = None) -> np.ndarray:
     """Matrices from the environment's coefficients in world space to those of the light in a corner's frame.
 
     Parameters
@@ -123,7 +131,14 @@ def corner_matrices(mesh, order, transfer=None):
     return result
 
 
-def vertex_transfer(meshes, order, *, bounces=0, albedo=(), progress=None):
+def vertex_transfer(
+    meshes: Sequence[MeshDescription],
+    order: int,
+    *,
+    bounces: int = 0,
+    albedo: Sequence[ArrayLike] = (),
+    progress: Progress | None = None,
+) -> list[np.ndarray]:
     """What the meshes let through and reflect, at every vertex.
 
     Parameters
@@ -190,7 +205,7 @@ def vertex_transfer(meshes, order, *, bounces=0, albedo=(), progress=None):
     return total
 
 
-def fibonacci(n):
+def fibonacci(n: int) -> np.ndarray:
     """Directions spread evenly over the sphere, shape (n, 3)."""
     i = np.arange(n) + 0.5
     z = 1 - 2 * i / n
@@ -199,7 +214,7 @@ def fibonacci(n):
     return np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
 
 
-def vertex_normals(mesh):
+def vertex_normals(mesh: MeshDescription) -> np.ndarray:
     """Unit normals of vertices; of a mesh without them, the mean of its triangles', shape (n, 3)."""
     if mesh.normals is not None:
         normals = np.asarray(mesh.normals, float) * (-1 if mesh.flip else 1)
@@ -210,14 +225,14 @@ def vertex_normals(mesh):
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
 
 
-def _diffuse(mesh, w, y):
+def _diffuse(mesh: MeshDescription, w: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
     """Coefficients of the clamped cosine about the normals of both sides, two of shape (vertices, order²)."""
     cosine = vertex_normals(mesh) @ w.T
     scale = np.sqrt(4 * np.pi / len(w))
     return [scale * (np.maximum(sign * cosine, 0).astype(np.float32) @ y) for sign in (1, -1)]
 
 
-def _mitsuba_mesh(mi, mesh, number):
+def _mitsuba_mesh(mi: JitArray, mesh: MeshDescription, number: int) -> JitArray:
     made = mi.Mesh(f"mesh_{number}", len(mesh.positions), len(mesh.faces))
     values = mi.traverse(made)
     values["vertex_positions"] = np.ascontiguousarray(mesh.positions, np.float32).ravel()
@@ -226,7 +241,15 @@ def _mitsuba_mesh(mi, mesh, number):
     return made
 
 
-def _hits(mi, scene, mesh, meshes, starts, w, offset):
+def _hits(
+    mi: JitArray,
+    scene: JitArray,
+    mesh: MeshDescription,
+    meshes: Sequence[MeshDescription],
+    starts: np.ndarray,
+    w: np.ndarray,
+    offset: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What every ray of every vertex meets.
 
     Returns
@@ -273,7 +296,9 @@ def _hits(mi, scene, mesh, meshes, starts, w, offset):
     return vertex, weight, side
 
 
-def _gathered(y, vertex, weight, side, sent):
+def _gathered(
+    y: np.ndarray, vertex: np.ndarray, weight: np.ndarray, side: np.ndarray, sent: np.ndarray
+) -> np.ndarray:
     """``Σ_d y_i(d) · radiance_j of what ray d meets``, shape (vertices, order², order²)."""
     n = sent.shape[-1]
     result = np.zeros((len(vertex), n, n), np.float32)
@@ -289,7 +314,7 @@ def _gathered(y, vertex, weight, side, sent):
     return result
 
 
-def clustered(matrices, settings):
+def clustered(matrices: np.ndarray, settings: TransferSettings) -> ClusteredTransfer:
     """Local PCA of corner matrices.
 
     Parameters

@@ -9,14 +9,22 @@ from __future__ import annotations
 
 import time
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref import conventions
 from btfref.numerics.sphere import harmonics, interpolation
 from btfref.numerics.sphere.parabolic import bilinear_stencil, texel_directions
 from btfref.rendering.environment_light.harmonic_light import shared_tables, table_coefficients
 from btfref.representations.protocol import LitByTransfer
+from btfref.types import PathLike
+
+if TYPE_CHECKING:
+    from btfref.rendering.environment_light.transfer import ClusteredTransfer
+    from btfref.representations.protocol import Representation
+
 
 #: Components of the matrices and of the material while the light moves, as in the paper.
 MOVING = 4, 1
@@ -39,7 +47,9 @@ class Material:
         For messages.
     """
 
-    def __init__(self, representation, order, *, map_size=16, file=None):
+    def __init__(
+        self, representation: Representation, order: int, *, map_size: int = 16, file: PathLike | None = None
+    ) -> None:
         _, cluster, weights = shared_tables(representation, LitByTransfer, file=file)
         # Clusters that no texel has are not computed.
         self.present, self.cluster = np.unique(cluster, return_inverse=True)
@@ -54,19 +64,21 @@ class Material:
         self.shape = seen.shape[2:]
         self.seen = seen.reshape(3, order * order, -1)
 
-    def part(self, components):
+    def part(self, components: int) -> np.ndarray:
         """The table's columns with all but the first ``components`` components of the material at zero."""
         kept = self.seen.reshape(3, self.order**2, *self.shape).copy()
         kept[..., components + 1 :] = 0
         return kept.reshape(self.seen.shape)
 
     @cached_property
-    def moving(self):
+    def moving(self) -> np.ndarray:
         """The columns while the light moves."""
         return self.part(MOVING[1])
 
 
-def transferred(transfer, light, *, two_sided=False, components=None):
+def transferred(
+    transfer: ClusteredTransfer, light: ArrayLike, *, two_sided: bool = False, components: int | None = None
+) -> np.ndarray:
     """The light after every matrix of the clusters.
 
     Parameters
@@ -95,7 +107,9 @@ def transferred(transfer, light, *, two_sided=False, components=None):
     return np.stack(sides, 1)
 
 
-def products(material, light, *, out=None, moving=False):
+def products(
+    material: Material, light: np.ndarray, *, out: np.ndarray | None = None, moving: bool = False
+) -> np.ndarray:
     """λ of all clusters, components and texels of the maps.
 
     Parameters
@@ -123,7 +137,7 @@ def products(material, light, *, out=None, moving=False):
     return out
 
 
-def encoded(table):
+def encoded(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """8-bit codes of :func:`products`, and their scales.
 
     Returns
@@ -144,7 +158,7 @@ def encoded(table):
     return codes, scales
 
 
-def decoded(codes, scales):
+def decoded(codes: np.ndarray, scales: np.ndarray) -> np.ndarray:
     """What codes stand for, float32."""
     table = (codes.astype(np.float32) - LEVELS) / LEVELS
     j, m = (np.minimum(np.arange(codes.shape[axis]), 1) for axis in (3, 6))
@@ -163,13 +177,22 @@ class TransferLight:
     bits : {8, 32}
     """
 
-    def __init__(self, material, transfer, light, *, two_sided=False, bits=32):
+    def __init__(
+        self,
+        material: Material,
+        transfer: ClusteredTransfer,
+        light: np.ndarray,
+        *,
+        two_sided: bool = False,
+        bits: int = 32,
+    ) -> None:
         self.material, self.transfer, self.two_sided, self.bits = material, transfer, two_sided, bits
         # Kept for the next light: new memory costs as much as the products.
-        self._full = self._coarse = None
+        self._full: np.ndarray | None = None
+        self._coarse: np.ndarray | None = None
         self.relight(light)
 
-    def relight(self, light, *, moving=False):
+    def relight(self, light: np.ndarray, *, moving: bool = False) -> None:
         """Take another light; ``moving`` computes few components of both, until the next call without it refines.
 
         Parameters
@@ -182,17 +205,15 @@ class TransferLight:
         components = MOVING[0] if moving else None
         rows = transferred(self.transfer, light, two_sided=self.two_sided, components=components)
         if moving:
-            self._coarse = products(self.material, rows, out=self._coarse, moving=True)
-            self.table = self._coarse
+            self.table = self._coarse = products(self.material, rows, out=self._coarse, moving=True)
         else:
-            self._full = products(self.material, rows, out=self._full)
-            self.table = self._full
+            self.table = self._full = products(self.material, rows, out=self._full)
         self.milliseconds = 1e3 * (time.perf_counter() - start)
         if self.bits == 8:
             self.codes, self.scales = encoded(self.table)
             self.table = decoded(self.codes, self.scales)
 
-    def tables(self):
+    def tables(self) -> dict[str, np.ndarray]:
         """What changes with the light and ``shaders/environment/lpca_transfer.glsl`` reads: products, their scales."""
         flat = (self.codes if self.bits == 8 else self.table).reshape(-1)
         missing = -len(flat) % 4
@@ -201,7 +222,7 @@ class TransferLight:
         scales = self.scales if self.bits == 8 else np.ones((2, 2), np.float32)
         return {"transfer_products": flat.reshape(-1, 4), "transfer_scales": scales.reshape(1, 4)}
 
-    def places(self):
+    def places(self) -> np.ndarray:
         """Of the material's clusters among those that are present, for shaders: float32 (clusters, 4)."""
         count = int(self.material.present.max()) + 1
         table = np.zeros((count, 4), np.float32)
@@ -209,11 +230,18 @@ class TransferLight:
         return table
 
     @property
-    def table_bytes(self):
+    def table_bytes(self) -> int:
         """Of the products as they are stored."""
         return int(self.table.size * self.bits // 8)
 
-    def radiance(self, uv, w_view, mirrored, triangle, barycentric):
+    def radiance(
+        self,
+        uv: np.ndarray,
+        w_view: np.ndarray,
+        mirrored: np.ndarray,
+        triangle: np.ndarray,
+        barycentric: np.ndarray,
+    ) -> np.ndarray:
         """Radiance towards the viewer in float64.
 
         Parameters
@@ -254,14 +282,14 @@ class TransferLight:
         return result
 
 
-def corner_table(transfer):
+def corner_table(transfer: ClusteredTransfer) -> np.ndarray:
     """Weights of corners for shaders, float32 (triangles · 3, 1 + components): the cluster in place of the first."""
     table = transfer.weights.reshape(-1, transfer.weights.shape[-1]).copy()
     table[:, 0] = transfer.cluster.ravel()
     return table
 
 
-def bins(transfer, neighbours):
+def bins(transfer: ClusteredTransfer, neighbours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Triangles that are drawn for each cluster.
 
     A triangle belongs to the bins of its corners, and of those across its edges: a ray tracer may give a sample at the

@@ -12,10 +12,17 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
 
 from btfref.errors import InputError
 from btfref.platform import shader_directory
+from btfref.types import PathLike
+
+if TYPE_CHECKING:
+    from btfref.representations.protocol import Representation
+
 
 #: The placeholder name in hosts for the representation's own file.
 REPRESENTATION = "representation"
@@ -45,7 +52,7 @@ class ShaderSource(str):
 
     files: tuple[str, ...]
 
-    def explain(self, log):
+    def explain(self, log: str) -> str:
         """The compiler's messages with file names in place of source-string numbers.
 
         Parameters
@@ -57,7 +64,7 @@ class ShaderSource(str):
         str
         """
 
-        def name(match):
+        def name(match: re.Match[str]) -> str:
             number = int(match[2])
             file = self.files[number] if number < len(self.files) else match[2]
             return f"{match[1]}{file}{match[3]}{match[4]}"
@@ -65,7 +72,15 @@ class ShaderSource(str):
         return _LOCATION.sub(name, log)
 
 
-def compose(name, defines=None, *, representation=None, environment=None, directories=(), target="330 core"):
+def compose(
+    name: str,
+    defines: Mapping[str, object] | None = None,
+    *,
+    representation: PathLike | None = None,
+    environment: PathLike | None = None,
+    directories: Sequence[PathLike] = (),
+    target: str = "330 core",
+) -> ShaderSource:
     """Put a shader together.
 
     Parameters
@@ -95,9 +110,11 @@ def compose(name, defines=None, *, representation=None, environment=None, direct
         raise InputError("unknown GLSL target", got=target, expected=" or ".join(TARGETS))
     search = [Path(directory) for directory in directories] + [shader_directory()]
     # File 0 is the text that the composer itself writes.
-    files, stack, seen = ["<definitions>"], [], set()
+    files = ["<definitions>"]
+    stack: list[Path] = []
+    seen: set[Path] = set()
 
-    def expand(included, asked_by):
+    def expand(included: str, asked_by: str | None) -> list[str]:
         wanted = included
         if included == REPRESENTATION:
             if representation is None:
@@ -144,7 +161,7 @@ def compose(name, defines=None, *, representation=None, environment=None, direct
     return source
 
 
-def _find(name, search, asked_by):
+def _find(name: str, search: Sequence[Path], asked_by: str | None) -> Path:
     path = Path(name)
     if path.is_absolute():
         if path.is_file():
@@ -156,7 +173,7 @@ def _find(name, search, asked_by):
     raise InputError("unknown shader file", file=asked_by, field="#include" if asked_by else None, got=name)
 
 
-def define_block(defines):
+def define_block(defines: Mapping[str, object]) -> str:
     """``#define`` lines for a dict of constants, names upper-cased.
 
     Booleans become 0 or 1, floats keep a decimal point (ES has no implicit conversion) and all their digits;
@@ -184,7 +201,7 @@ def define_block(defines):
     return "".join(lines)
 
 
-def _literal(name, value):
+def _literal(name: str, value: Any) -> str:
     if isinstance(value, str):
         if "\n" in value:
             raise InputError("a GLSL constant spans lines", field=name, got=repr(value))
@@ -200,7 +217,7 @@ def _literal(name, value):
     raise InputError("a GLSL constant of an unsupported type", field=name, got=type(value).__name__)
 
 
-def representation_defines(rep):
+def representation_defines(rep: Representation) -> dict[str, Any]:
     """Constants that a representation's GLSL file may use.
 
     For each port array NAME of shape (a, b, …, k): ``NAME_DIM0 a``, ``NAME_DIM1 b``, …, the last one counted
@@ -215,7 +232,7 @@ def representation_defines(rep):
     -------
     dict
     """
-    defines = {}
+    defines: dict[str, Any] = {}
     maps = rep.arrays()
     for name, array in rep.port_arrays().items():
         leading = array.shape[:-1]

@@ -6,14 +6,23 @@ Nothing here knows a method: a representation comes as its port arrays and its G
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from btfref.errors import BtfrefError, InputError, MissingDependencyError
 from btfref.rendering.gl import composer
 from btfref.representations.lookup import packed_arrays
+from btfref.types import JitArray, PathLike
+
+if TYPE_CHECKING:
+    from btfref.rendering.environment_light.prepared import Prepared
+    from btfref.representations.protocol import Representation
+
 
 #: Texels of a row of a table's texture; shaders/lib/lookup/table.glsl takes the index apart with the same number.
 TABLE_WIDTH = 4096
@@ -22,8 +31,12 @@ TABLE_WIDTH = 4096
 _DTYPES = {"float16": "f2", "float32": "f4", "uint32": "u4", "uint8": "f1"}
 
 
+#: Without a window; apart, because moderngl declares the value of "backend" as a dictionary.
+EGL: dict[str, Any] = {"backend": "egl"}
+
+
 @cache
-def context():
+def context() -> JitArray:
     """The process's OpenGL context (EGL, no window).
 
     Returns
@@ -40,7 +53,7 @@ def context():
     import moderngl
 
     try:
-        return moderngl.create_context(standalone=True, backend="egl", require=330)
+        return moderngl.create_context(standalone=True, require=330, **EGL)
     except Exception as error:  # moderngl and glcontext raise bare Exception
         raise MissingDependencyError(
             f"no OpenGL 3.3 context through EGL ({error})",
@@ -48,13 +61,13 @@ def context():
         ) from error
 
 
-def facts(ctx):
+def facts(ctx: JitArray) -> dict[str, str]:
     """Vendor, renderer and version of the driver, as a dict of str."""
     names = {"gl_vendor": "GL_VENDOR", "gl_renderer": "GL_RENDERER", "gl_version": "GL_VERSION"}
     return {key: ctx.info[name] for key, name in names.items()}
 
 
-def upload(ctx, array, name):
+def upload(ctx: JitArray, array: np.ndarray, name: str) -> JitArray:
     """A table as an array texture of RGBA texels in C order.
 
     Parameters
@@ -120,15 +133,22 @@ class ShaderRepresentation:
         File with ``btf_environment``.
     """
 
-    textures: dict
-    defines: dict
+    textures: dict[str, JitArray]
+    defines: dict[str, Any]
     shader: str
-    directories: list
-    texels: tuple = (1, 1)
+    directories: Sequence[PathLike]
+    texels: tuple[int, int] = (1, 1)
     environment: str | None = None
 
     @classmethod
-    def upload(cls, ctx, rep, *, filter_type=None, light=None):
+    def upload(
+        cls,
+        ctx: JitArray,
+        rep: Representation,
+        *,
+        filter_type: str | None = None,
+        light: Prepared | None = None,
+    ) -> ShaderRepresentation:
         """Put ``rep`` on the GPU.
 
         Parameters
@@ -137,7 +157,7 @@ class ShaderRepresentation:
         rep : Representation
         filter_type : {"nearest", "bilinear"}, optional
             Overrides the file's texel filter.
-        light : btfref.rendering.environment_light.lighting.Prepared, optional
+        light : btfref.rendering.environment_light.prepared.Prepared, optional
             How an environment lights it: its tables come along.
         """
         defines = shader_defines(rep, filter_type=filter_type)
@@ -147,10 +167,18 @@ class ShaderRepresentation:
             defines |= light_defines(light.tables, light.constants)
             arrays = {**arrays, **packed_arrays(light.tables)}
         textures = {name: upload(ctx, array, name) for name, array in arrays.items()}
-        texels = tuple(rep.meta.get("texels", (1, 1)))
-        return cls(textures, defines, shader, directories, texels, light and light.shader)
+        rows, columns = rep.meta.get("texels", (1, 1))
+        return cls(textures, defines, shader, directories, (rows, columns), light.shader if light else None)
 
-    def program(self, ctx, vertex, fragment=None, *, varyings=(), defines=None):
+    def program(
+        self,
+        ctx: JitArray,
+        vertex: str,
+        fragment: str | None = None,
+        *,
+        varyings: Sequence[str] = (),
+        defines: Mapping[str, object] | None = None,
+    ) -> JitArray:
         """Compile hosts with this representation; see :func:`compile_program`."""
         return compile_program(
             ctx,
@@ -163,38 +191,47 @@ class ShaderRepresentation:
             directories=self.directories,
         )
 
-    def release(self):
+    def release(self) -> None:
         """Give the textures back."""
         for texture in self.textures.values():
             texture.release()
 
 
-def shader_defines(rep, *, filter_type=None):
+def shader_defines(rep: Representation, *, filter_type: str | None = None) -> dict[str, Any]:
     """Constants of a representation's shader, the texel filter included; for the composer."""
     filter_type = filter_type or rep.meta["filter_type"]
     return {**composer.representation_defines(rep), "FILTER_BILINEAR": filter_type == "bilinear"}
 
 
-def light_defines(tables, constants=None):
+def light_defines(
+    tables: Mapping[str, np.ndarray], constants: Mapping[str, object] | None = None
+) -> dict[str, Any]:
     """Constants of the shader that reads the tables of a way to light: their shapes and strides, and its own."""
-    defines = {"HAS_ENVIRONMENT": True, **(constants or {})}
+    defines: dict[str, Any] = {"HAS_ENVIRONMENT": True, **(constants or {})}
     for name, table in tables.items():
         defines |= {f"{name}_DIM{axis}".upper(): n for axis, n in enumerate(table.shape)}
         defines[f"{name}_STRIDE".upper()] = -(-table.shape[-1] // 4)
     return defines
 
 
-def shader_file(rep):
+def shader_file(rep: Representation) -> tuple[str, list[Path]]:
     """The GLSL file of a representation's method and the directories to look for it."""
     from importlib.resources import files
 
     from btfref.registry import method
 
     row = method(rep.meta["method"])
-    return row.shader, [files(row.shader_package)] if row.shader_package else []
+    return row.shader, [Path(str(files(row.shader_package)))] if row.shader_package else []
 
 
-def compile_program(ctx, vertex, fragment=None, *, varyings=(), **composition):
+def compile_program(
+    ctx: JitArray,
+    vertex: str,
+    fragment: str | None = None,
+    *,
+    varyings: Sequence[str] = (),
+    **composition: Any,
+) -> JitArray:
     """Compose, compile and link two hosts.
 
     Parameters
@@ -226,7 +263,7 @@ def compile_program(ctx, vertex, fragment=None, *, varyings=(), **composition):
         raise BtfrefError(f"shader {vertex} {fragment or ''}: {source.explain(str(error))}") from error
 
 
-def bind(program, textures, *, first=0):
+def bind(program: JitArray, textures: Mapping[str, JitArray], *, first: int = 0) -> None:
     """Give every texture a unit and tell the samplers; samplers that the compiler dropped are skipped."""
     for unit, (name, texture) in enumerate(sorted(textures.items()), start=first):
         if name in program:
@@ -234,7 +271,7 @@ def bind(program, textures, *, first=0):
             program[name].value = unit
 
 
-def set_uniforms(program, values):
+def set_uniforms(program: JitArray, values: Mapping[str, Any]) -> None:
     """Set uniforms by name; those that the compiler dropped are skipped."""
     for name, value in values.items():
         if name in program:

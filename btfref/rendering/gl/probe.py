@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.rendering.gl import device
+from btfref.types import JitArray
+
+if TYPE_CHECKING:
+    from btfref.rendering.environment_light.prepared import Prepared
+    from btfref.representations.protocol import Representation
 
 
-def probe(rep, uv, w_light, w_view, lod=0.0, *, filter_type=None):
+def probe(
+    rep: Representation,
+    uv: ArrayLike,
+    w_light: ArrayLike,
+    w_view: ArrayLike,
+    lod: ArrayLike = 0.0,
+    *,
+    filter_type: str | None = None,
+) -> np.ndarray:
     """Values of ``rep`` computed by its shader.
 
     Parameters
@@ -39,7 +56,9 @@ def probe(rep, uv, w_light, w_view, lod=0.0, *, filter_type=None):
         return made.values()
 
 
-def probe_malformed(rep, uv, w_light, w_view):
+def probe_malformed(
+    rep: Representation, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike
+) -> dict[str, int]:
     """How many lookups the shader counts as malformed: what `btfref.conventions.malformed` counts in NumPy.
 
     Parameters
@@ -67,13 +86,21 @@ def probe_malformed(rep, uv, w_light, w_view):
     return dict(zip(("directions", "coordinates"), found.tolist(), strict=True))
 
 
-def probe_environment(rep, light, uv, w_view, to_world, *, filter_type=None):
+def probe_environment(
+    rep: Representation,
+    light: Prepared,
+    uv: ArrayLike,
+    w_view: ArrayLike,
+    to_world: ArrayLike,
+    *,
+    filter_type: str | None = None,
+) -> np.ndarray:
     """Radiance of ``rep`` under an environment, computed by its shader.
 
     Parameters
     ----------
     rep : Representation
-    light : btfref.rendering.environment_light.lighting.Prepared
+    light : btfref.rendering.environment_light.prepared.Prepared
         How the environment lights it.
     uv : array_like, shape (N, 2)
     w_view : array_like, shape (N, 3)
@@ -99,7 +126,7 @@ def probe_environment(rep, light, uv, w_view, to_world, *, filter_type=None):
         tables.release()
         return np.zeros((0, 3), np.float32)
     with PointProbe(tables, "hosts/probe_environment.vert", names, points) as made:
-        total = 0
+        total = np.zeros((len(points), 3), np.float32)
         for values in light.passes:
             made.run(values)
             total = total + made.values()
@@ -123,7 +150,14 @@ class PointProbe:
         Name of the result, and how many floats it has.
     """
 
-    def __init__(self, tables, host, names, points, result=("value", 3)):
+    def __init__(
+        self,
+        tables: device.ShaderRepresentation,
+        host: str,
+        names: Mapping[str, int],
+        points: np.ndarray,
+        result: tuple[str, int] = ("value", 3),
+    ) -> None:
         self.ctx = device.context()
         self._owned, self._n = [tables], len(points)
         # Without a bound framebuffer transform feedback on a surfaceless context returns zeros, without an error.
@@ -141,18 +175,18 @@ class PointProbe:
         self._result = self._own(self.ctx.buffer(reserve=4 * result[1] * self._n))
         self._width = result[1]
 
-    def __enter__(self):
+    def __enter__(self) -> PointProbe:
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         while self._owned:
             self._owned.pop().release()
 
-    def _own(self, thing):
+    def _own(self, thing: JitArray) -> JitArray:
         self._owned.append(thing)
         return thing
 
-    def run(self, uniforms=None):
+    def run(self, uniforms: Mapping[str, Any] | None = None) -> None:
         """Evaluate all points, with uniforms by name, and wait."""
         self._target.use()
         device.bind(self._program, self._textures)
@@ -160,19 +194,27 @@ class PointProbe:
         self._vertices.transform(self._result, mode=self.ctx.POINTS, vertices=self._n)
         self.ctx.finish()
 
-    def values(self):
+    def values(self) -> np.ndarray:
         """What the last run found, float32 (N, width of the result)."""
         return np.frombuffer(self._result.read(), np.float32).reshape(-1, self._width).copy()
 
 
-def probe_points(rep, points, *, filter_type=None, result=("value", 3)):
+def probe_points(
+    rep: Representation,
+    points: np.ndarray,
+    *,
+    filter_type: str | None = None,
+    result: tuple[str, int] = ("value", 3),
+) -> PointProbe:
     """A :class:`PointProbe` of ``rep`` at rows of :func:`broadcast_points`; the caller runs and releases it."""
     names = {"uv": 2, "w_light": 3, "w_view": 3, "lod": 1}
     tables = device.ShaderRepresentation.upload(device.context(), rep, filter_type=filter_type)
     return PointProbe(tables, "hosts/probe.vert", names, points, result)
 
 
-def broadcast_points(uv, w_light, w_view, lod=0.0):
+def broadcast_points(
+    uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, lod: ArrayLike = 0.0
+) -> tuple[np.ndarray, tuple[int, ...]]:
     """The arguments of ``evaluate`` as rows (uv, w_light, w_view, lod) of float32.
 
     Returns

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.scene.shapes import neighbours
 
+if TYPE_CHECKING:
+    from btfref.scene.description import Camera, Light
+    from btfref.scene.shapes import BtfMaterial, MeshDescription
 
-def material_uniforms(material, texels, angle):
+
+def material_uniforms(material: BtfMaterial, texels: tuple[int, int], angle: float) -> dict[str, Any]:
     """What ``shaders/hosts/mesh.frag`` and ``shaders/lib/surface/lod.glsl`` read of a material.
 
     Parameters
@@ -33,7 +40,7 @@ def material_uniforms(material, texels, angle):
     }
 
 
-def triangle_table(mesh):
+def triangle_table(mesh: MeshDescription) -> np.ndarray:
     """Triangles as ``shaders/lib/surface/triangle_table.glsl`` reads them.
 
     Parameters
@@ -57,7 +64,7 @@ def triangle_table(mesh):
     return table
 
 
-def world_to_clip(camera, offset, near, far):
+def world_to_clip(camera: Camera, offset: tuple[float, float], near: float, far: float) -> np.ndarray:
     """Projection that puts the film point at ``offset`` in each pixel on that pixel's centre.
 
     Parameters
@@ -88,7 +95,7 @@ def world_to_clip(camera, offset, near, far):
     return project @ np.linalg.inv(to_world)
 
 
-def clip_planes(camera, meshes):
+def clip_planes(camera: Camera, meshes: Sequence[MeshDescription]) -> tuple[float, float]:
     """Near and far planes around the scene: the depth buffer then resolves what is there."""
     depths = [camera.depth(mesh.positions[mesh.faces.ravel()]) for mesh in meshes if len(mesh.faces)]
     if not depths:
@@ -98,7 +105,7 @@ def clip_planes(camera, meshes):
     return near, max(min(camera.far, 1.01 * high), 1.01 * near)
 
 
-def light_uniforms(lights):
+def light_uniforms(lights: Sequence[Light]) -> dict[str, np.ndarray]:
     """What ``shaders/lib/light/lights.glsl`` reads of directional and point lights."""
     position = [[*light.position, 0.0 if light.kind == "directional" else 1.0] for light in lights]
     return {"light_position": np.array(position), "light_power": np.array([light.power for light in lights])}

@@ -9,6 +9,8 @@ samples a pixel, box filter. Each sample is one frame with a shifted projection;
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,22 +28,40 @@ from btfref.rendering.gl.raster import (
 )
 from btfref.scene.demand import MARGIN, kept_maps, number_kept
 from btfref.scene.description import SceneDescription, read_scene
+from btfref.types import Facts, JitArray, SceneLike
+
+if TYPE_CHECKING:
+    from btfref.rendering.environment_light.lighting import Lighting
+    from btfref.rendering.environment_light.prepared import Prepared
+    from btfref.rendering.environment_light.transfer import TransferSettings
+    from btfref.rendering.environment_light.transfer_light import TransferLight
+    from btfref.representations.protocol import Representation
+    from btfref.scene.environment import Environment
+    from btfref.scene.loading import Kept
+    from btfref.scene.shapes import MeshDescription
+
+
+#: Gives the representation of a file.
+LoadFile = Callable[[str], "Representation"]
+
+#: Of what is shown: file, texel filter, and the mesh where each has light of its own.
+Key = tuple[str, str | None, int | None]
 
 
 def realtime(
-    scene,
+    scene: SceneLike | SceneDescription,
     *,
-    parameters=None,
-    grid=4,
-    size=None,
-    keep="all",
-    environment="auto",
-    lights=None,
-    order=None,
-    window=None,
-    transfer=None,
-    count_fetches=False,
-):
+    parameters: Mapping[str, object] | None = None,
+    grid: int = 4,
+    size: tuple[int, int] | None = None,
+    keep: str = "all",
+    environment: str = "auto",
+    lights: int | None = None,
+    order: int | None = None,
+    window: str | None = None,
+    transfer: TransferSettings | None = None,
+    count_fetches: bool = False,
+) -> RenderResult:
     """Render a scene with OpenGL.
 
     Parameters
@@ -91,12 +111,12 @@ def realtime(
         raise InputError("the sub-pixel grid needs a sample", field="grid", got=grid, expected="≥ 1")
     if keep != "all" and isinstance(scene, SceneDescription):
         raise InputError("the maps that are needed follow from a scene file", field="keep", got=keep)
-    file = scene
+    needed: Kept = {}
     if not isinstance(scene, SceneDescription):
-        scene = read_scene(scene, parameters, size=size)
-    needed = kept_maps(keep, file, parameters, description=scene, grid=grid, size=size, margin=MARGIN)
+        file, scene = scene, read_scene(scene, parameters, size=size)
+        needed = kept_maps(keep, file, parameters, description=scene, grid=grid, size=size, margin=MARGIN)
 
-    def load_needed(path):
+    def load_needed(path: str) -> Representation:
         return representations.load(path, **needed[path])
 
     lighting = lighting_of(scene, environment, lights=lights, order=order, window=window, transfer=transfer)
@@ -150,18 +170,22 @@ class Renderer:
         Have :meth:`fetches` tell the texels fetched; a little slower.
     """
 
-    def __init__(self, scene, load_file=None, *, lighting=None, count_fetches=False):
+    def __init__(
+        self,
+        scene: SceneDescription,
+        load_file: LoadFile | None = None,
+        *,
+        lighting: Lighting | None = None,
+        count_fetches: bool = False,
+    ) -> None:
         if not scene.lights and scene.environment is None:
             raise InputError("the scene has no light", file=scene.source, field="emitter")
-        for mesh in scene.meshes:
-            if mesh.material is None:
-                where = f"{scene.source}: shape {mesh.name}"
-                raise InputError(
-                    "real-time rendering needs a btf material", file=where, field="bsdf", got=mesh.bsdf
-                )
+        scene.demand_btfs("real-time rendering")
         self.ctx = device.context()
         self.camera = scene.camera
-        self._owned, self._shown, self._meshes = [], {}, []
+        self._owned: list[JitArray] = []
+        self._shown: dict[Key, tuple[device.ShaderRepresentation, JitArray, JitArray, Prepared | None]] = {}
+        self._meshes: list[tuple[MeshDescription, Key, JitArray]] = []
         size = (self.camera.width, self.camera.height)
         limit = self.ctx.info["GL_MAX_RENDERBUFFER_SIZE"]
         if max(size) > limit:
@@ -178,7 +202,9 @@ class Renderer:
         self._n_lights, self._lighting = len(scene.lights), lighting
         if lighting is None:
             self._lighting = lighting_of(scene)
-        self._light_facts, self._depth, self._seen = {}, None, None
+        self._light_facts: Facts = {}
+        self._depth: tuple[JitArray, JitArray] | None = None
+        self._seen: tuple[JitArray, JitArray, JitArray, JitArray] | None = None
         self._counting = {"COUNT_FETCHES": 1} if count_fetches else {}
         try:
             for number, mesh in enumerate(scene.meshes):
@@ -187,18 +213,18 @@ class Renderer:
             self.release()
             raise
 
-    def __enter__(self):
+    def __enter__(self) -> Renderer:
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self.release()
 
-    def _own(self, thing):
+    def _own(self, thing: JitArray) -> JitArray:
         self._owned.append(thing)
         return thing
 
-    def _add(self, number, mesh, load_file):
-        material = mesh.material
+    def _add(self, number: int, mesh: MeshDescription, load_file: LoadFile) -> None:
+        material = mesh.btf
         own = number if self._lighting is not None and self._lighting.per_mesh else None
         key = (material.filename, material.filter_type, own)
         if key not in self._shown:
@@ -214,7 +240,7 @@ class Renderer:
             by_pixel = light is not None and len(light.passes) > 1 and light.bins is None
             if by_pixel:
                 defines["SEEN"] = 1
-                self._make_seen()
+                self._what_is_seen()
             vertex = "hosts/screen.vert" if by_pixel else "hosts/mesh.vert"
             program = shown.program(self.ctx, vertex, "hosts/mesh.frag", defines=defines)
             self._own(program), self._own(shown)
@@ -222,7 +248,7 @@ class Renderer:
         table = self._own(device.upload(self.ctx, triangle_table(mesh), "triangles"))
         self._meshes.append((mesh, key, table))
 
-    def _make_seen(self):
+    def _what_is_seen(self) -> tuple[JitArray, JitArray, JitArray, JitArray]:
         """What each pixel sees: passes that add up shade pixels, not triangles of less than a pixel anew each time."""
         if self._seen is None:
             size = (self.camera.width, self.camera.height)
@@ -230,10 +256,11 @@ class Renderer:
             target = self._own(self.ctx.framebuffer([texture], self._own(self.ctx.depth_renderbuffer(size))))
             program = self._own(device.compile_program(self.ctx, "hosts/mesh.vert", "hosts/seen.frag"))
             self._seen = texture, target, program, self._own(self.ctx.vertex_array(program, []))
+        return self._seen
 
-    def _fill_seen(self, common):
+    def _fill_seen(self, common: dict[str, Any]) -> None:
         """Find what each pixel sees, in all meshes."""
-        _, target, program, vertices = self._seen
+        _, target, program, vertices = self._what_is_seen()
         target.use()
         target.clear(0.0, 0.0, 0.0, 0.0)
         for number, (mesh, _, table) in enumerate(self._meshes):
@@ -242,14 +269,14 @@ class Renderer:
             vertices.render(self.ctx.TRIANGLES, vertices=3 * len(mesh.faces))
         self._target.use()
 
-    def _depth_program(self):
+    def _depth_program(self) -> tuple[JitArray, JitArray]:
         """Black surfaces: what fills the depth buffer before pictures are added up."""
         if self._depth is None:
             program = self._own(device.compile_program(self.ctx, "hosts/mesh.vert", "hosts/depth.frag"))
             self._depth = program, self._own(self.ctx.vertex_array(program, []))
         return self._depth
 
-    def draw(self, offset=(0.5, 0.5), *, share=1.0):
+    def draw(self, offset: tuple[float, float] = (0.5, 0.5), *, share: float = 1.0) -> float:
         """Draw a frame.
 
         Parameters
@@ -293,17 +320,16 @@ class Renderer:
                 shown, program, vertices, light = self._shown[key]
                 tables, by_pixel = {**shown.textures, "triangles": table}, "seen" in program
                 if by_pixel:
-                    tables["seen"] = self._seen[0]
+                    tables["seen"] = self._what_is_seen()[0]
                     ctx.depth_func, self._target.depth_mask = ">", False
                 device.bind(program, tables)
-                own = material_uniforms(mesh.material, shown.texels, share * camera.pixel_angle)
+                own = material_uniforms(mesh.btf, shown.texels, share * camera.pixel_angle)
                 device.set_uniforms(program, {**common, **own, "mesh": index})
-                passes, counts = ({},), [len(mesh.faces)]
-                if light is not None:
-                    passes, counts = light.passes, counts * len(light.passes)
-                    if light.bins is not None:
-                        counts = np.diff(light.bins).tolist()
-                        device.set_uniforms(program, {"transfer_components": light.transfer.table.shape[3]})
+                passes: Sequence[Facts] = ({},) if light is None else light.passes
+                counts = [len(mesh.faces)] * len(passes)
+                if light is not None and light.bins is not None and light.transfer is not None:
+                    counts = np.diff(light.bins).tolist()
+                    device.set_uniforms(program, {"transfer_components": light.transfer.table.shape[3]})
                 for number, (values, count) in enumerate(zip(passes, counts, strict=True)):
                     device.set_uniforms(program, {**values, "pass": number})
                     vertices.render(ctx.TRIANGLES, vertices=3 if by_pixel else 3 * count)
@@ -315,19 +341,19 @@ class Renderer:
         return max(1e-6 * query.elapsed, 1e3 * (time.perf_counter() - start))
 
     @property
-    def transfers(self):
+    def transfers(self) -> list[TransferLight]:
         """What can be lit anew, one :class:`btfref.rendering.environment_light.transfer_light.TransferLight` a mesh."""
         lights = [light for *_, light in self._shown.values()]
         return [light.transfer for light in lights if light is not None and light.transfer is not None]
 
     @property
-    def environment_facts(self):
+    def environment_facts(self) -> Facts:
         """How the environment lights: the facts of one file, or facts by file where there are several."""
         if len(self._light_facts) == 1:
             return next(iter(self._light_facts.values()))
         return {"environment_path": dict(self._light_facts)} if self._light_facts else {}
 
-    def _fill_depth(self, common):
+    def _fill_depth(self, common: dict[str, Any]) -> None:
         """Draw all surfaces black; what follows adds to what is nearest."""
         ctx = self.ctx
         program, vertices = self._depth_program()
@@ -339,7 +365,7 @@ class Renderer:
         ctx.enable(ctx.BLEND)
         ctx.blend_func = ctx.ONE, ctx.ONE
 
-    def relight(self, environment, *, moving=False):
+    def relight(self, environment: Environment, *, moving: bool = False) -> None:
         """Light all by another environment through the matrices that are there (way "transfer" only).
 
         Parameters
@@ -357,22 +383,24 @@ class Renderer:
             raise InputError("only transferred light changes", field="environment", expected="transfer")
         coefficients = self._lighting.coefficients_of(environment)
         for shown, _, _, light in self._shown.values():
+            assert light is not None
+            assert light.transfer is not None
             light.transfer.relight(coefficients, moving=moving)
             for name, table in light.transfer.tables().items():
                 shown.textures.pop(name).release()
                 shown.textures[name] = device.upload(self.ctx, table, name)
 
-    def read(self):
+    def read(self) -> np.ndarray:
         """The frame, float32 (H, W, 3), row 0 at the top."""
         pixels = np.frombuffer(self._target.read(components=3, dtype="f4"), np.float32)
         return pixels.reshape(self.camera.height, self.camera.width, 3)[::-1]
 
-    def fetches(self):
+    def fetches(self) -> np.ndarray:
         """Texels fetched for each pixel of the frame, shape (H, W); −1 where nothing is seen."""
         pixels = np.frombuffer(self._target.read(components=4, dtype="f4"), np.float32)
         return pixels.reshape(self.camera.height, self.camera.width, 4)[::-1, :, 3]
 
-    def release(self):
+    def release(self) -> None:
         """Give everything on the GPU back."""
         while self._owned:
             self._owned.pop().release()

@@ -7,6 +7,8 @@ approximation's own error. Primary hits are Mitsuba's; everything behind them is
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,11 +21,26 @@ from btfref.representations.protocol import HasLevels
 from btfref.scene.description import read_scene
 from btfref.scene.hits import Hits, surfaces
 from btfref.scene.loading import loaded
+from btfref.types import SceneLike
+
+if TYPE_CHECKING:
+    from btfref.rendering.environment_light.prepared import Prepared
+    from btfref.representations.protocol import Representation
+    from btfref.scene.description import SceneDescription
+    from btfref.scene.shapes import MeshDescription
 
 
 def approximate(
-    scene, *, parameters=None, path="auto", grid=4, size=None, load_file=None, pixels=None, **options
-):
+    scene: SceneLike,
+    *,
+    parameters: Mapping[str, object] | None = None,
+    path: str = "auto",
+    grid: int = 4,
+    size: tuple[int, int] | None = None,
+    load_file: Callable[[str], Representation] | None = None,
+    pixels: np.ndarray | None = None,
+    **options: Any,
+) -> RenderResult:
     """What :func:`btfref.rendering.gl.renderer.realtime` approximates, evaluated in float64.
 
     Parameters
@@ -61,12 +78,7 @@ def approximate(
     description = read_scene(scene, parameters, size=size)
     if not description.lights and description.environment is None:
         raise InputError("the scene has no light", file=description.source, field="emitter")
-    for mesh in description.meshes:
-        if mesh.material is None:
-            where = f"{description.source}: shape {mesh.name}"
-            raise InputError(
-                "the approximation needs a btf material", file=where, field="bsdf", got=mesh.bsdf
-            )
+    description.demand_btfs("the approximation")
     lighting = lighting_of(description, path, **options)
     start, camera = time.perf_counter(), description.camera
     reps, prepared, total = {}, {}, np.zeros((camera.height * camera.width, 3))
@@ -74,13 +86,13 @@ def approximate(
     with loaded(scene, parameters, size=size) as made:
         for surface in surfaces(made, grid):
             for number, (mesh, shape) in enumerate(zip(description.meshes, made.shapes(), strict=True)):
-                hits = Hits.of(surface, mesh.material, np.flatnonzero(surface.sees(shape) & wanted))
+                hits = Hits.of(surface, mesh.btf, np.flatnonzero(surface.sees(shape) & wanted))
                 if not len(hits.at):
                     continue
-                name = mesh.material.filename
+                name = mesh.btf.filename
                 if name not in reps:
                     reps[name] = (load_file or representations.load)(name)
-                rep = _filtered(reps[name], mesh.material.filter_type)
+                rep = _filtered(reps[name], mesh.btf.filter_type)
                 light = None
                 if lighting is not None:
                     key = (name, number) if lighting.per_mesh else name
@@ -88,7 +100,7 @@ def approximate(
                         prepared[key] = lighting.prepared(rep, file=name, mesh=number)
                     light = prepared[key]
                 value = _radiance(rep, hits, mesh, description, grid, light)
-                total[hits.at] += mesh.material.scale * value
+                total[hits.at] += mesh.btf.scale * value
     image = (total / grid**2).reshape(camera.height, camera.width, 3)
     facts = [{"environment_path": p.path, **p.facts} for p in prepared.values()]
     meta = {
@@ -105,7 +117,7 @@ def approximate(
     return RenderResult(image.astype(np.float32), None, meta)
 
 
-def _filtered(representation, filter_type):
+def _filtered(representation: Representation, filter_type: str | None) -> Representation:
     """The representation with the material's texel filter."""
     if filter_type in (None, representation.meta["filter_type"]):
         return representation
@@ -113,13 +125,20 @@ def _filtered(representation, filter_type):
     return type(representation).from_arrays(representation.arrays(), meta)
 
 
-def _radiance(representation, hits, mesh, description, grid, prepared):
+def _radiance(
+    representation: Representation,
+    hits: Hits,
+    mesh: MeshDescription,
+    description: SceneDescription,
+    grid: int,
+    prepared: Prepared | None,
+) -> np.ndarray:
     """Radiance towards the viewer without the material's factor, shape (N, 3)."""
     levels, camera = isinstance(representation, HasLevels), description.camera
     texels = representation.meta["texels"]
     footprint = hits.footprint(camera.origin, camera.pixel_angle / grid, texels) if levels else ()
 
-    def evaluate(uv, w_light, w_view, at):
+    def evaluate(uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray, at: np.ndarray) -> np.ndarray:
         if not levels:
             return representation.evaluate(uv, w_light, w_view)
         lod, step, ratio = (a[at] for a in footprint)

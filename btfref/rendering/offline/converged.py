@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,6 +13,11 @@ from btfref.gates.tolerances import gate_table, tolerance
 from btfref.rendering.offline.reference import BATCHES, traced
 from btfref.scene.camera import tell_camera
 from btfref.scene.loading import loaded
+from btfref.types import Progress, SceneLike
+
+if TYPE_CHECKING:
+    from btfref.rendering import RenderResult
+
 
 #: Samples a pixel of the first round, and most of all rounds.
 FIRST, MOST = 256, 1 << 16
@@ -20,18 +27,18 @@ RATE = 1.4
 
 
 def converged(
-    scene,
-    mask,
+    scene: SceneLike,
+    mask: np.ndarray,
     *,
-    gate,
-    parameters=None,
-    size=None,
-    seed=1,
-    shadows=True,
-    grid=None,
-    most=MOST,
-    progress=None,
-):
+    gate: str | Sequence[str],
+    parameters: Mapping[str, object] | None = None,
+    size: tuple[int, int] | None = None,
+    seed: int = 1,
+    shadows: bool = True,
+    grid: int | None = None,
+    most: int = MOST,
+    progress: Progress | None = None,
+) -> RenderResult:
     """Path trace until the noise decides nothing.
 
     Parameters
@@ -60,7 +67,8 @@ def converged(
     """
     limits = [gate_table(key) for key in ([gate] if isinstance(gate, str) else gate)]
     seeds = np.random.SeedSequence(seed).generate_state(32)
-    mean = squared = total = 0.0
+    mean = squared = np.zeros((1, 1, 1, 3))
+    total = 0.0
     done, count = 0, FIRST
     with loaded(scene, parameters, size=size) as made:
         # One footprint for all rounds.
@@ -69,17 +77,18 @@ def converged(
             found = traced(made, spp=count, seed=int(number), shadows=shadows, grid=grid, with_variance=True)
             done += found.meta["spp"]
             # Rounds are weighted by what their noise says: a long round is better than as many short ones.
+            assert found.variance is not None
             noise = float(found.variance[mask].mean()) if mask.any() else 0.0
             weight = 1 / max(noise, 1e-30)
-            pictures = (found.pictures if grid else found.image[None]).astype(float)
+            pictures = (found.image[None] if found.pictures is None else found.pictures).astype(float)
             share = weight / (total + weight)
             mean = mean + share * (pictures - mean)
-            squared = (1 - share) ** 2 * squared + share**2 * found.variance.astype(float)
+            squared = (1 - share) ** 2 * squared + share**2 * found.variance.astype(float)[None]
             total += weight
             image = mean.mean(0)
             scale = float(np.abs(image[mask]).mean()) if mask.any() else 0.0
-            noise = float(np.sqrt(squared[mask].mean())) / scale if scale > 0 else 0.0
-            ratio = _ratio(noise, squared / scale**2, mask, limits) if scale > 0 else 0.0
+            noise = float(np.sqrt(squared[0][mask].mean())) / scale if scale > 0 else 0.0
+            ratio = _ratio(noise, squared[0] / scale**2, mask, limits) if scale > 0 else 0.0
             if progress:
                 progress(min(done, most), most, f"reference, {ratio:.2g} of the noise that is allowed")
             if ratio <= 1 or done >= most:
@@ -91,13 +100,15 @@ def converged(
     return replace(
         found,
         image=image.astype(np.float32),
-        variance=squared.astype(np.float32),
+        variance=squared[0].astype(np.float32),
         meta=meta,
         pictures=mean.astype(np.float32) if grid else None,
     )
 
 
-def _ratio(noise, variance, mask, limits):
+def _ratio(
+    noise: float, variance: np.ndarray, mask: np.ndarray, limits: Sequence[Mapping[str, Any]]
+) -> float:
     """The largest noise over what one of the gates admits; ``variance`` is relative."""
     pixel, tile = (
         tolerance(f"reference.{name}.max_fraction") for name in ("standard_error", "tile_half_width")

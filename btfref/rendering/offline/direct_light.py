@@ -64,7 +64,7 @@ def on_grid(
     return RenderResult(pictures.mean(0), variance, settings, pictures)
 
 
-def make_integrator(shadows):
+def make_integrator(shadows: bool) -> JitArray:
     """An integrator for the current variant: direct light of delta lights and of an environment.
 
     Light is sampled by the emitters and by the material, combined by the power heuristic (Veach, Guibas 1995).
@@ -81,10 +81,17 @@ def make_integrator(shadows):
     import mitsuba as mi
 
     class DirectLight(mi.SamplingIntegrator):
-        def __init__(self, props):
+        def __init__(self, props: JitArray) -> None:
             mi.SamplingIntegrator.__init__(self, props)
 
-        def sample(self, scene, sampler, ray, medium=None, active=True):
+        def sample(
+            self,
+            scene: JitArray,
+            sampler: JitArray,
+            ray: JitArray,
+            medium: JitArray = None,
+            active: JitArray = True,
+        ) -> tuple[JitArray, JitArray, list[JitArray]]:
             si = scene.ray_intersect(mi.Ray3f(ray), active)
             active = mi.Bool(active) & si.is_valid()
             numbers = sampler.next_2d(active), sampler.next_1d(active), sampler.next_2d(active)
@@ -94,18 +101,27 @@ def make_integrator(shadows):
                 [],
             )
 
-        def to_string(self):
+        def to_string(self) -> str:
             return f"DirectLight[shadows={shadows}]"
 
     return DirectLight(mi.Properties())
 
 
-def _direct(scene, si, bsdf, of_light, lobe, of_bsdf, shadows, active):
+def _direct(
+    scene: JitArray,
+    si: JitArray,
+    bsdf: JitArray,
+    of_light: JitArray,
+    lobe: JitArray,
+    of_bsdf: JitArray,
+    shadows: bool,
+    active: JitArray,
+) -> JitArray:
     """Radiance at surface interactions from uniform numbers: two for the emitters, one and two for the material."""
     import drjit as dr
     import mitsuba as mi
 
-    def heuristic(a, b):
+    def heuristic(a: JitArray, b: JitArray) -> JitArray:
         a, b = a * a, b * b
         return dr.select(a > 0, a / (a + b), 0)
 
@@ -131,7 +147,9 @@ def _direct(scene, si, bsdf, of_light, lobe, of_bsdf, shadows, active):
     return result
 
 
-def regular(scene, grid, spp, seed, shadows):
+def regular(
+    scene: JitArray, grid: int, spp: int, seed: int, shadows: bool
+) -> tuple[np.ndarray, np.ndarray, int]:
     """Direct light at n × n regular sub-pixel positions: random are the light's directions alone.
 
     Against a renderer that has the same positions no difference of texture sampling is left. The samples of a round
@@ -207,11 +225,10 @@ def regular(scene, grid, spp, seed, shadows):
         batches[..., at] += values.reshape(-1, ROUNDS, 3, len(at)).mean(0) / grid**2
         variance[:, at] += values.var(0, ddof=1) / rounds / grid**4
     pictures = batches.reshape(ROUNDS, 3, height, width).transpose(0, 2, 3, 1).astype(np.float32)
-    variance = variance.T.reshape(height, width, 3).astype(np.float32)
-    return pictures, variance, rounds * step * grid**2
+    return pictures, variance.T.reshape(height, width, 3).astype(np.float32), rounds * step * grid**2
 
 
-def noise_free(scene, n, shadows):
+def noise_free(scene: JitArray, n: int, shadows: bool) -> np.ndarray:
     """Mean over the n × n grid of Σ over delta lights of incident power × ``bsdf.eval``; float32 (H, W, 3)."""
     sensor = scene.sensors()[0]
     width, height = (int(k) for k in sensor.film().crop_size())
@@ -222,7 +239,7 @@ def noise_free(scene, n, shadows):
     return (total.T / n**2).reshape(height, width, 3).astype(np.float32)
 
 
-def _exact(scene, ray, shadows):
+def _exact(scene: JitArray, ray: JitArray, shadows: bool) -> JitArray:
     """Radiance along camera rays: Σ over delta lights of incident power × ``bsdf.eval``."""
     import drjit as dr
     import mitsuba as mi
@@ -232,7 +249,7 @@ def _exact(scene, ray, shadows):
     context = mi.BSDFContext()
     emitters = scene.emitters_dr()
 
-    def body(i, sum_):
+    def body(i: JitArray, sum_: JitArray) -> tuple[JitArray, JitArray]:
         emitter = dr.gather(mi.EmitterPtr, emitters, i, si.is_valid())
         sample, power = emitter.sample_direction(si, mi.Point2f(0.5), si.is_valid())
         active = si.is_valid() & (sample.pdf > 0)

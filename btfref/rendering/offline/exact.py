@@ -10,6 +10,8 @@ bending the mesostructure around the shape would change is beyond any BTF and is
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +22,13 @@ from btfref.scene.description import read_scene
 from btfref.scene.hits import Hits
 from btfref.scene.lights import distant_or_delta
 from btfref.scene.loading import loaded
+from btfref.types import JitArray, SceneLike
+
+if TYPE_CHECKING:
+    from btfref.sampling.tiled_scene import TiledScene
+    from btfref.scene.description import SceneDescription
+    from btfref.scene.shapes import BtfMaterial
+
 
 #: Independent pictures that the result is the mean of.
 BATCHES = 4
@@ -28,9 +37,21 @@ BATCHES = 4
 LANES = 1 << 20
 
 
+#: Of paths: lane, origin, direction, throughput, and the lights with their powers.
+State = tuple[JitArray, JitArray, JitArray, JitArray, list[tuple[JitArray, JitArray]]]
+
+
 def render_exact(
-    scene, *, parameters=None, spp=16, grid=2, seed=0, size=None, max_depth=None, batches=BATCHES
-):
+    scene: SceneLike,
+    *,
+    parameters: Mapping[str, object] | None = None,
+    spp: int = 16,
+    grid: int = 2,
+    seed: int = 0,
+    size: tuple[int, int] | None = None,
+    max_depth: int | None = None,
+    batches: int = BATCHES,
+) -> RenderResult:
     """Path trace the mesostructure at the hits of a scene with delta lights or an environment, without cast shadows.
 
     Parameters
@@ -73,7 +94,7 @@ def render_exact(
     depth = depth if max_depth is None else max_depth
     height, width = description.camera.height, description.camera.width
     rounds = -(-spp // grid**2)
-    pictures = np.zeros((batches, 3, height * width))
+    sums = np.zeros((batches, 3, height * width))
     with loaded(scene, parameters, size=size) as made:
         # Lights at any height: the largest patch that there is, and rays beyond it wrap.
         tiles = TiledScene(mesostructure, np.array([[1.0, 0.0, 1e-6]]))
@@ -81,8 +102,8 @@ def render_exact(
         for first in range(0, batches, together):
             count = min(together, batches - first)
             passed = _pass(made, material, tiles, grid, rounds, (seed, first, count), depth)
-            pictures[first : first + count] = passed.reshape(3, count, -1).swapaxes(0, 1)
-    pictures = np.moveaxis(pictures / (rounds * grid**2), 1, 2).reshape(batches, height, width, 3)
+            sums[first : first + count] = passed.reshape(3, count, -1).swapaxes(0, 1)
+    pictures = np.moveaxis(sums / (rounds * grid**2), 1, 2).reshape(batches, height, width, 3)
     meta = {
         "renderer": "exact",
         "spp": rounds * grid**2 * batches,
@@ -97,7 +118,15 @@ def render_exact(
     )
 
 
-def _pass(scene, material, tiles, grid, rounds, stream, max_depth):
+def _pass(
+    scene: JitArray,
+    material: BtfMaterial,
+    tiles: TiledScene,
+    grid: int,
+    rounds: int,
+    stream: tuple[int, int, int],
+    max_depth: int,
+) -> np.ndarray:
     """Sums of ``rounds`` samples in every cell of every pixel's grid, for some batches; (3, count · pixels) float64.
 
     ``stream`` is the seed, the number of the first batch, and how many batches follow each other.
@@ -131,7 +160,7 @@ def _pass(scene, material, tiles, grid, rounds, stream, max_depth):
     return np.array(samples, np.float64).reshape(3, -1, each).sum(-1)
 
 
-def _taken(value, index):
+def _taken(value: Any, index: JitArray) -> Any:
     """Nested arrays gathered at an index."""
     import drjit as dr
 
@@ -140,7 +169,9 @@ def _taken(value, index):
     return dr.gather(type(value), value, index)
 
 
-def _vertex(tiles, state, number, keys, samples):
+def _vertex(
+    tiles: TiledScene, state: State, number: int, keys: JitArray, samples: JitArray
+) -> tuple[State, JitArray]:
     """Trace to the next vertex, connect it to the lights, sample the way on."""
     import drjit as dr
     import mitsuba as mi
@@ -174,7 +205,9 @@ def _vertex(tiles, state, number, keys, samples):
     return state, alive
 
 
-def _single_material(scene, parameters=None, *, size=None):
+def _single_material(
+    scene: SceneLike, parameters: Mapping[str, object] | None = None, *, size: tuple[int, int] | None = None
+) -> tuple[SceneDescription, BtfMaterial]:
     """The description of a scene whose shapes all show one BTF, and that material.
 
     Returns
@@ -189,21 +222,26 @@ def _single_material(scene, parameters=None, *, size=None):
     description = read_scene(scene, parameters, size=size)
     materials = [mesh.material for mesh in description.meshes]
     first = materials[0] if materials else None
-    same = first is not None and all(
+    if first is None or not all(
         m is not None
         and (m.filename, m.filter_type, m.scale, m.twosided)
         == (first.filename, first.filter_type, 1.0, first.twosided)
         and np.array_equal(m.to_uv, first.to_uv)
         for m in materials
-    )
-    if not same:
+    ):
         raise InputError(
             "all shapes must show one btf material of scale 1", file=description.source, field="bsdf"
         )
     return description, first
 
 
-def _intersect(scene, material, offset, pixel, chosen):
+def _intersect(
+    scene: JitArray,
+    material: BtfMaterial,
+    offset: tuple[JitArray, JitArray],
+    pixel: JitArray,
+    chosen: JitArray,
+) -> tuple[JitArray, JitArray, JitArray, list[tuple[JitArray, JitArray]]]:
     """Hits of one camera ray a pixel, as Dr.Jit arrays.
 
     Parameters

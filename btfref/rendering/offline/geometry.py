@@ -6,7 +6,9 @@ difference to a render of the BTF is the error that no representation removes.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +16,12 @@ from btfref.conventions import PixelClass
 from btfref.errors import InputError
 from btfref.rendering import RenderResult
 from btfref.scene.description import read_scene
+from btfref.types import Facts, JitArray, PathLike, SceneLike
+
+if TYPE_CHECKING:
+    from btfref.mesostructure import Mesostructure
+    from btfref.scene.description import Camera, Light, SceneDescription
+
 
 #: Independent renders that a picture is the mean of; their spread gives the variance.
 ROUNDS = 16
@@ -41,7 +49,7 @@ class _Plane:
     filename: str
 
     @property
-    def matrix(self):
+    def matrix(self) -> np.ndarray:
         """From tile coordinates to the world, (4, 4)."""
         matrix = np.eye(4)
         matrix[:3] = np.stack([self.x, self.y, self.normal * self.size, self.origin], axis=1)
@@ -49,16 +57,16 @@ class _Plane:
 
 
 def render_geometry(
-    scene,
+    scene: SceneLike,
     *,
-    parameters=None,
-    mesostructure=None,
-    spp=256,
-    seed=0,
-    size=None,
-    max_depth=None,
-    variant="llvm_ad_rgb",
-):
+    parameters: Mapping[str, object] | None = None,
+    mesostructure: PathLike | Mesostructure | None = None,
+    spp: int = 256,
+    seed: int = 0,
+    size: tuple[int, int] | None = None,
+    max_depth: int | None = None,
+    variant: str = "llvm_ad_rgb",
+) -> RenderResult:
     """Path trace a flat BTF scene with the mesostructure in place of the BTF.
 
     Parameters
@@ -142,7 +150,14 @@ def render_geometry(
     return RenderResult(mean.astype(np.float32), variance.astype(np.float32), meta)
 
 
-def geometry_classes(scene, *, parameters=None, mesostructure=None, size=None, grid=4):
+def geometry_classes(
+    scene: SceneLike,
+    *,
+    parameters: Mapping[str, object] | None = None,
+    mesostructure: PathLike | Mesostructure | None = None,
+    size: tuple[int, int] | None = None,
+    grid: int = 4,
+) -> np.ndarray:
     """Where the geometry truth of a flat BTF scene may be compared with the BTF.
 
     Parameters
@@ -191,7 +206,7 @@ def geometry_classes(scene, *, parameters=None, mesostructure=None, size=None, g
     border = np.minimum(tile - plane.low, plane.high - tile).min(-1)
     inner = hit & (border > depth * reach)
 
-    def per_pixel(mask, reduce):
+    def per_pixel(mask: np.ndarray, reduce: Callable[..., np.ndarray]) -> np.ndarray:
         blocks = mask.reshape(camera.height, grid + 1, camera.width, grid + 1)
         return reduce(blocks, axis=(1, 3))
 
@@ -201,7 +216,7 @@ def geometry_classes(scene, *, parameters=None, mesostructure=None, size=None, g
     return classes
 
 
-def _tangent(w, normal):
+def _tangent(w: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Tangent of the angle to the normal; 0 below the horizon, where nothing is lit or seen."""
     z = w @ normal
     length = np.einsum("...i,...i->...", w, w)
@@ -209,16 +224,16 @@ def _tangent(w, normal):
     return np.where(z > 0, across / np.where(z > 0, z, 1.0), 0.0)
 
 
-def _plane(description):
+def _plane(description: SceneDescription) -> _Plane:
     """The scene's only shape as a plane in tile coordinates."""
     source = description.source
-    if len(description.meshes) != 1 or description.meshes[0].material is None:
+    mesh = description.meshes[0] if len(description.meshes) == 1 else None
+    if mesh is None or mesh.material is None:
         raise InputError(
             "geometry truth wants one flat shape with a btf material",
             file=source,
             got=f"{len(description.meshes)} shapes",
         )
-    mesh = description.meshes[0]
     material = mesh.material
     if material.scale != 1:
         raise InputError("geometry has no scale", file=source, field="scale", got=material.scale, expected=1)
@@ -252,7 +267,7 @@ def _plane(description):
     return _Plane(origin, x, y, normal, size, tile.min(0), tile.max(0), material.filename)
 
 
-def _parent(filename):
+def _parent(filename: PathLike) -> Facts:
     """Mesostructure and depth that the BTF behind a representation was made from."""
     from btfref.representations.file.container import read_info
 
@@ -263,7 +278,7 @@ def _parent(filename):
     return {"max_depth": depth, **(ancestor or {})}
 
 
-def mesostructure_of(filename):
+def mesostructure_of(filename: PathLike) -> tuple[Mesostructure, int]:
     """The mesostructure that a representation was made from, and the path depth of its synthesis.
 
     Parameters
@@ -283,13 +298,13 @@ def mesostructure_of(filename):
     return _built(filename, parent), parent.get("max_depth", 8)
 
 
-def _mesostructure(plane, parent, given):
+def _mesostructure(plane: _Plane, parent: Facts, given: PathLike | Mesostructure | None) -> Mesostructure:
     from btfref.mesostructure import build
 
     return _built(plane.filename, parent) if given is None else build(given)
 
 
-def _built(filename, parent):
+def _built(filename: PathLike, parent: Facts) -> Mesostructure:
     from btfref.mesostructure import FROM_FILES, build
     from btfref.sampling.job import fingerprint
 
@@ -310,7 +325,7 @@ def _built(filename, parent):
     return built
 
 
-def _sensor(mi, camera):
+def _sensor(mi: JitArray, camera: Camera) -> dict[str, Any]:
     return {
         "type": "perspective",
         "to_world": mi.ScalarTransform4f(np.asarray(camera.to_world, np.float64)),
@@ -330,7 +345,7 @@ def _sensor(mi, camera):
     }
 
 
-def _light(light):
+def _light(light: Light) -> dict[str, Any]:
     power = {"type": "rgb", "value": [float(value) for value in light.power]}
     position = [float(value) for value in light.position]
     if light.kind == "directional":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -14,26 +15,26 @@ from btfref.sampling.variant import no_collection
 from btfref.scene.camera import tell_camera
 from btfref.scene.demand import MARGIN, kept_maps, number_kept
 from btfref.scene.loading import loaded
-from btfref.types import Facts
+from btfref.types import Facts, JitArray, SceneLike
 
 #: Independent renders whose spread gives the variance of the mean: 15 degrees of freedom.
 BATCHES = 16
 
 
 def render(
-    scene,
+    scene: SceneLike,
     *,
-    parameters=None,
-    variant="llvm_ad_rgb",
-    spp=None,
-    seed=0,
-    grid=None,
-    shadows=True,
-    size=None,
-    with_variance=False,
-    keep="all",
-    debug=False,
-):
+    parameters: Mapping[str, object] | None = None,
+    variant: str = "llvm_ad_rgb",
+    spp: int | None = None,
+    seed: int = 0,
+    grid: int | None = None,
+    shadows: bool = True,
+    size: tuple[int, int] | None = None,
+    with_variance: bool = False,
+    keep: str = "all",
+    debug: bool = False,
+) -> RenderResult:
     """Render a scene with Mitsuba.
 
     Parameters
@@ -102,7 +103,15 @@ def render(
 
 
 @no_collection()
-def traced(made, *, spp=None, seed=0, grid=None, shadows=True, with_variance=False):
+def traced(
+    made: JitArray,
+    *,
+    spp: int | None = None,
+    seed: int = 0,
+    grid: int | None = None,
+    shadows: bool = True,
+    with_variance: bool = False,
+) -> RenderResult:
     """A picture of a scene that is `loaded`; further ones cost no loading.
 
     Parameters
@@ -139,7 +148,7 @@ def traced(made, *, spp=None, seed=0, grid=None, shadows=True, with_variance=Fal
     return replace(found, meta=facts)
 
 
-def _monte_carlo(scene, spp, seed, with_variance, shadows):
+def _monte_carlo(scene: JitArray, spp: int, seed: int, with_variance: bool, shadows: bool) -> RenderResult:
     import mitsuba as mi
 
     integrator = scene.integrator() if shadows else make_integrator(shadows=False)
@@ -151,7 +160,7 @@ def _monte_carlo(scene, spp, seed, with_variance, shadows):
         "shadows": shadows,
     }
 
-    def once(count, number):
+    def once(count: int, number: int) -> np.ndarray:
         return np.array(mi.render(scene, integrator=integrator, spp=count, seed=number), np.float32)[..., :3]
 
     if not with_variance:
@@ -161,7 +170,7 @@ def _monte_carlo(scene, spp, seed, with_variance, shadows):
     batches = min(BATCHES, spp)
     count = -(-spp // batches)
     seeds = np.random.SeedSequence(seed).generate_state(batches)
-    mean, square = 0.0, 0.0
+    mean = square = np.zeros((1, 1, 3))
     for done, number in enumerate(seeds):
         # Welford: the batches differ by little, sums of squares would lose it.
         image = once(count, int(number)).astype(float)

@@ -11,11 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from btfref.types import PathLike
+
 #: Step of the central differences that give the normals: balances truncation and rounding in float64.
 _STEP = 1e-6
 
 
-def sphere(u, v):
+def sphere(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Unit sphere; u ∈ [0, 2] around z, v ∈ [0, 1] from the south to the north pole; (...) -> (..., 3).
 
     One tile of v spans the meridian; two tiles of u span the equator, so that texels are square there. At the
@@ -25,7 +27,7 @@ def sphere(u, v):
     return np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], -1)
 
 
-def cloth(u, v):
+def cloth(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Square cloth, u and v ∈ [0, 1], that hangs in soft folds from a round table; (...) -> (..., 3)."""
     x, y = 2 * u - 1, 2 * v - 1
     square = x**2 + y**2
@@ -36,7 +38,7 @@ def cloth(u, v):
     return np.stack([x, y, height + 0.085 * square / (0.35 + square) * folds], -1)
 
 
-def bowl(u, v):
+def bowl(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Square bowl, u and v ∈ [0, 1], deep enough that its walls hide much of the sky; (...) -> (..., 3)."""
     x, y = 2 * u - 1, 2 * v - 1
     # The square of the radius, flattened towards the corners so that they do not stick out.
@@ -52,7 +54,7 @@ SURFACES = {
 }
 
 
-def surface_mesh(name):
+def surface_mesh(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """A shipped mesh.
 
     Parameters
@@ -88,7 +90,7 @@ def surface_mesh(name):
     return positions, normals, uv, faces[area > 1e-9]
 
 
-def write(directory):
+def write(directory: PathLike) -> None:
     """Write all meshes as binary PLY files ``NAME.ply`` into ``directory``."""
     import trimesh
 
