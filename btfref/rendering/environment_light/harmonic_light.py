@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from btfref import conventions
 from btfref.errors import InputError
 from btfref.numerics.sphere import harmonics, interpolation
 from btfref.numerics.sphere.quadrature import gauss_hemisphere
 from btfref.rendering.environment_light import light_set
+from btfref.rendering.environment_light.prepared import Stencil, by_stencils
 from btfref.representations.protocol import LitByHarmonics
 from btfref.types import PathLike
 
@@ -37,9 +37,6 @@ CELL_ROWS = 256
 
 #: Order of the rule that integrates what receivers see of the harmonics.
 ESTIMATE = 48
-
-#: Points evaluated at a time in float64.
-CHUNK = 1 << 11
 
 
 def shared_tables(
@@ -178,21 +175,14 @@ def radiance(
     """
     order = int(np.sqrt(len(light)))
     _, cluster, weights = shared_tables(representation, LitByHarmonics)
-    meta = representation.meta
-    views = interpolation.from_arrays(representation.arrays(), "view")
-    uv, w_view, to_world = (np.asarray(a, float) for a in (uv, w_view, to_world))
-    result = np.zeros((len(uv), 3))
-    for first in range(0, len(uv), CHUNK):
-        at = first + np.flatnonzero(conventions.valid_directions(w_view[first : first + CHUNK]))
-        if not len(at):
-            continue
-        local = harmonics.rotate(light, to_world[at], order)
-        texel, texel_weight = conventions.texel_stencil(uv[at], meta["texels"], meta["filter_type"])
-        view, view_weight = views.stencil(w_view[at])
-        for t in range(texel.shape[1]):
-            own = cluster[texel[:, t]]
-            for v in range(view.shape[1]):
-                share = (texel_weight[:, t] * view_weight[:, v])[:, None]
-                seen = np.einsum("nimc,nm->nic", coefficients[own, view[:, v]], weights[texel[:, t]])
-                result[at] += share * np.einsum("nic,nic->nc", seen, local)
-    return result
+
+    def kernel(texel: Stencil, view: Stencil, w_view: np.ndarray, frame: np.ndarray) -> np.ndarray:
+        local, result = harmonics.rotate(light, frame, order), np.zeros((len(frame), 3))
+        for index, texel_weight in zip(*(a.T for a in texel), strict=True):
+            own, mixed = cluster[index], weights[index]
+            for direction, view_weight in zip(*(a.T for a in view), strict=True):
+                seen = np.einsum("nimc,nm->nic", coefficients[own, direction], mixed)
+                result += (texel_weight * view_weight)[:, None] * np.einsum("nic,nic->nc", seen, local)
+        return result
+
+    return by_stencils(representation, kernel, uv, w_view, to_world)

@@ -12,34 +12,25 @@ A class a method, found by the registry: ``SHADER`` provides ``btf_environment``
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from btfref import conventions
 from btfref.numerics.powers import FLOOR, safe_power
-from btfref.numerics.sphere import interpolation
 from btfref.rendering.environment_light import prefilter
+from btfref.rendering.environment_light.prepared import Stencil, by_stencils
 from btfref.rendering.environment_light.split_light import split_light, unsplit
 from btfref.representations.analytic import lafortune, rf_lobes, rf_poly
 from btfref.representations.analytic.lafortune import flat_maps
 from btfref.representations.analytic.light_functions import held
 from btfref.representations.analytic.rf_lobes import parabolic_axis
-from btfref.representations.lookup import CHUNK
 
 if TYPE_CHECKING:
     from btfref.rendering.environment_light.split_light import Cells, SplitLight
     from btfref.representations.protocol import Representation
     from btfref.scene.environment import Environment
-
-
-#: Indices and weights of what an interpolation reads, each of shape (N, k).
-Stencil = tuple[np.ndarray, np.ndarray]
-
-#: ``kernel(texel, view, w_view, frame)``: radiance at some points, shape (N, 3).
-Kernel = Callable[[Stencil, Stencil, np.ndarray, np.ndarray], np.ndarray]
 
 
 class _PrefilteredLobes:
@@ -115,7 +106,7 @@ class Lobes(_PrefilteredLobes):
             value += colour[texel[0]][..., 3:] * _irradiance(maps, frame)[:, None]
             return np.einsum("nt,ntc,ntc->nc", texel[1], value, colour[texel[0]][..., :3])
 
-        return _evaluated(representation, kernel, uv, w_view, to_world)
+        return by_stencils(representation, kernel, uv, w_view, to_world)
 
 
 class Lafortune(_PrefilteredLobes):
@@ -155,7 +146,7 @@ class Lafortune(_PrefilteredLobes):
                 value *= np.einsum("ntv,nv->nt", factor, view[1])[..., None]
             return np.einsum("nt,ntc,ntc->nc", texel[1], value, flat["colour"][texel[0]][..., :3])
 
-        return _evaluated(representation, kernel, uv, w_view, to_world)
+        return by_stencils(representation, kernel, uv, w_view, to_world)
 
 
 class Polynomials:
@@ -206,7 +197,7 @@ class Polynomials:
             value = np.einsum("ntk,nkc->ntc", coefficient, moments)
             return np.einsum("nt,ntc,ntc->nc", texel[1], value, chroma[texel[0]])
 
-        return _evaluated(representation, kernel, uv, w_view, to_world)
+        return by_stencils(representation, kernel, uv, w_view, to_world)
 
 
 def radiance(
@@ -248,22 +239,3 @@ def radiance(
 def _irradiance(maps: np.ndarray, frame: np.ndarray) -> np.ndarray:
     """The first slice is the cosine."""
     return np.pi * prefilter.map_lookup(maps, np.zeros(len(frame), int), frame[:, :, 2])
-
-
-def _evaluated(
-    representation: Representation, kernel: Kernel, uv: ArrayLike, w_view: ArrayLike, to_world: ArrayLike
-) -> np.ndarray:
-    """Stencils, validity and bounded memory around a method's kernel."""
-    meta = representation.meta
-    views = interpolation.from_arrays(representation.arrays(), "view")
-    uv, w_view, to_world = (np.asarray(a, float) for a in (uv, w_view, to_world))
-    result = np.zeros((len(uv), 3))
-    step = CHUNK // 16
-    for first in range(0, len(uv), step):
-        part = slice(first, first + step)
-        valid = first + np.flatnonzero(conventions.valid_directions(w_view[part]))
-        if len(valid):
-            texel = conventions.texel_stencil(uv[valid], meta["texels"], meta["filter_type"])
-            view = views.stencil(w_view[valid])
-            result[valid] = kernel(texel, view, w_view[valid], to_world[valid])
-    return result

@@ -185,14 +185,10 @@ class Lighting:
         tables = light.tables(representation, split.rest)
 
         def radiance(
-            uv: np.ndarray,
-            w_view: np.ndarray,
-            to_world: np.ndarray,
-            evaluate: Evaluate | None = None,
-            place: Place | None = None,
+            *at: np.ndarray, evaluate: Evaluate | None = None, place: Place | None = None
         ) -> np.ndarray:
-            filtered = light.radiance(representation, tables, uv, w_view, to_world)
-            return filtered + lit(representation, split.lights, uv, w_view, to_world, evaluate)
+            filtered = light.radiance(representation, tables, *at)
+            return filtered + lit(representation, split.lights, *at, evaluate=evaluate)
 
         return self._with_lights("prefiltered", light.SHADER, tables, radiance, split.lights)
 
@@ -200,13 +196,9 @@ class Lighting:
         found = self.light_set
 
         def radiance(
-            uv: np.ndarray,
-            w_view: np.ndarray,
-            to_world: np.ndarray,
-            evaluate: Evaluate | None = None,
-            place: Place | None = None,
+            *at: np.ndarray, evaluate: Evaluate | None = None, place: Place | None = None
         ) -> np.ndarray:
-            return lit(representation, found, uv, w_view, to_world, evaluate)
+            return lit(representation, found, *at, evaluate=evaluate)
 
         return self._with_lights("lights", "environment/lights.glsl", {}, radiance, found)
 
@@ -230,13 +222,9 @@ class Lighting:
         stored = found.astype(np.float32)
 
         def radiance(
-            uv: np.ndarray,
-            w_view: np.ndarray,
-            to_world: np.ndarray,
-            evaluate: Evaluate | None = None,
-            place: Place | None = None,
+            *at: np.ndarray, evaluate: Evaluate | None = None, place: Place | None = None
         ) -> np.ndarray:
-            return harmonic_light.radiance(representation, stored, light, uv, w_view, to_world)
+            return harmonic_light.radiance(representation, stored, light, *at)
 
         tables = {
             "environment_harmonics": light.astype(np.float32),
@@ -273,13 +261,10 @@ class Lighting:
             bin_numbers.append(-1)
 
         def radiance(
-            uv: np.ndarray,
-            w_view: np.ndarray,
-            to_world: np.ndarray,
-            evaluate: Evaluate | None = None,
-            place: Place | None = None,
+            *at: np.ndarray, evaluate: Evaluate | None = None, place: Place | None = None
         ) -> np.ndarray:
             assert place is not None
+            uv, w_view, to_world = at
             return light.radiance(uv, w_view, np.linalg.det(to_world) < 0, *place())
 
         tables = {

@@ -165,5 +165,7 @@ def _radiance(
         w_light = np.einsum("ni,nij->nj", towards, hits.to_world)
         total += power * evaluate(hits.uv, w_light, hits.w_view, everywhere)
     if prepared is not None:
-        total += prepared.radiance(hits.uv, hits.w_view, hits.to_world, evaluate, lambda: hits.place(mesh))
+        total += prepared.radiance(
+            hits.uv, hits.w_view, hits.to_world, evaluate=evaluate, place=lambda: hits.place(mesh)
+        )
     return total
