@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
+if TYPE_CHECKING:
+    import numpy as np
 
-def pytest_addoption(parser):
+    from btfref.comparison import Comparison
+    from btfref.types import PathLike
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the option."""
     parser.getgroup("btfref").addoption(
         "--btfref-report", metavar="FOLDER", help="write a page for every picture that fails its reference"
@@ -16,11 +24,11 @@ def pytest_addoption(parser):
 
 
 @pytest.fixture
-def matches_reference(request):
+def matches_reference(request: pytest.FixtureRequest) -> Callable[..., Comparison]:
     """`btfref.testing.assert_matches_reference`, with a page for failures where the command line asks for it."""
     folder, count = request.config.getoption("--btfref-report"), 0
 
-    def check(image, scene, **arguments):
+    def check(image: PathLike | np.ndarray, scene: PathLike, **arguments: Any) -> Comparison:
         from btfref.testing import assert_matches_reference
 
         __tracebackhide__ = True

@@ -15,24 +15,33 @@ picture that fails.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from btfref.comparison import Comparison
+    from btfref.types import PathLike
+
 
 __all__ = ["assert_matches_reference"]
 
 
 def assert_matches_reference(
-    image,
-    scene,
+    image: PathLike | np.ndarray,
+    scene: PathLike,
     *,
-    btf=None,
-    size=None,
-    grid=4,
-    shadows=False,
-    gates=None,
-    cache=None,
-    report=None,
-    **parameters,
-):
+    btf: PathLike | None = None,
+    size: tuple[int, int] | None = None,
+    grid: int = 4,
+    shadows: bool = False,
+    gates: str | Sequence[str] | None = None,
+    cache: PathLike | None = None,
+    report: PathLike | None = None,
+    **parameters: object,
+) -> Comparison:
     """Fail unless a picture passes the gates against the reference of a scene.
 
     Parameters
@@ -86,6 +95,7 @@ def assert_matches_reference(
     if failed and report is not None:
         from btfref.report import Cell, write_report
 
+        assert comparison.test is not None
         pictures = {"reference": expected.image, "test": comparison.test.astype(np.float32)}
         cell = Cell(f"{Path(str(scene)).stem}", pictures, comparison, f"parameters: {values}")
         write_report(report, title="Does not match its reference", cells=[cell], facts={"parameters": values})

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from btfref.sampling import SampledBTF
+    from btfref.types import Progress
+
 
 #: What tables of papers are made of.
 MESOSTRUCTURES = ("checker", "rings", "tissue")
 
 
-def checker(*, texels=64, spp=2, progress=None):
+def checker(*, texels: int = 64, spp: int = 2, progress: Progress | None = None) -> SampledBTF:
     """The checker at 81² directions, in memory; drafts are enough where only the size matters.
 
     Parameters
@@ -25,7 +32,9 @@ def checker(*, texels=64, spp=2, progress=None):
     return synthesize("checker", texels=texels, spp=spp, progress=progress)
 
 
-def materials(btf, names, *, progress=None, **settings):
+def materials(
+    btf: SampledBTF | None, names: Iterable[str], *, progress: Progress | None = None, **settings: Any
+) -> Iterator[tuple[str, SampledBTF]]:
     """What a table goes through: the BTF that a user brings, or mesostructures.
 
     Parameters
@@ -51,7 +60,7 @@ def materials(btf, names, *, progress=None, **settings):
         yield name, synthesize(name, progress=progress, **settings)
 
 
-def material_name(btf):
+def material_name(btf: SampledBTF) -> str:
     """What a BTF is of: its mesostructure if it was synthesized, else the name of its file."""
     parent = btf.attributes.get("parent", {})
     if "mesostructure" in (parent.get("kind"), *btf.attributes):

@@ -8,15 +8,26 @@ parts and whole are measured in turn, in one process with warm kernels.
 from __future__ import annotations
 
 import itertools
+import operator
 import shutil
 import tempfile
 import time
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial, reduce
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.bench.timing import interleaved, machine, peak_memory, reset_peak, summary
+
+if TYPE_CHECKING:
+    from btfref.representations.protocol import Representation
+    from btfref.sampling import SampledBTF
+    from btfref.scene.demand import Demand
+    from btfref.types import Facts, PathLike, Progress
+
 
 #: Scenes for which the BTF is traced: one camera and one light each.
 TRACED = {
@@ -44,7 +55,13 @@ METHODS = ("raw", "lpca", "laplacian", "rf_lobes", "gbrdf")
 BASELINE = "whole"
 
 
-def run(*, quick=False, progress=None, btf=None, only=None):
+def run(
+    *,
+    quick: bool = False,
+    progress: Progress | None = None,
+    btf: SampledBTF | None = None,
+    only: Iterable[str] | None = None,
+) -> Facts:
     """Costs of parts and shares of scenes.
 
     Parameters
@@ -75,7 +92,7 @@ def run(*, quick=False, progress=None, btf=None, only=None):
     return result
 
 
-def synthesis(folder, quick, progress):
+def synthesis(folder: Path, quick: bool, progress: Progress) -> Facts:
     """Parts that scenes need against the whole: times, their law, bytes, pictures."""
     from btfref.numerics.sphere.directions import directions
     from btfref.sampling.store.selection import Selection
@@ -87,7 +104,8 @@ def synthesis(folder, quick, progress):
     size = (32, 32) if quick else (256, 256)
     directions_name = "3x6" if quick else "ubo81"
     known = directions(directions_name)
-    needed, seconds_demand = {}, {}
+    needed: dict[str, Demand] = {}
+    seconds_demand = {}
     for name, (scene, parameters) in TRACED.items():
         progress(len(needed), len(TRACED), "first hits")
         start = time.perf_counter()
@@ -109,7 +127,8 @@ def synthesis(folder, quick, progress):
         "single pair": Selection(views[:1], lights[:1]),
     }
     settings = {"texels": texels, "spp": spp, "views": directions_name, "lights": directions_name}
-    pairs, seconds = {}, {name: [] for name in parts}
+    seconds: dict[str, list[float]] = {name: [] for name in parts}
+    pairs = {}
     # Parts warm all kernels up: the whole once more would take a minute.
     warm_up = [] if quick else [(name, False) for name in parts if name != BASELINE]
     turns = warm_up + [(name, True) for _ in range(rounds) for name in parts]
@@ -154,7 +173,7 @@ def synthesis(folder, quick, progress):
     }
 
 
-def cost_law(parts):
+def cost_law(parts: Mapping[str, tuple[int, int, float]]) -> Facts:
     """Constant, seconds per view and per pair from the times of parts: t = a + b views + c pairs, none below 0.
 
     Parameters
@@ -183,7 +202,7 @@ def cost_law(parts):
     }
 
 
-def _pictures(folder, name, size):
+def _pictures(folder: Path, name: str, size: tuple[int, int]) -> Facts:
     """The scene's picture from what was traced for it and from the whole: whether equal, and shares of the table."""
     from btfref.rendering.offline.reference import render
     from btfref.representations import save
@@ -210,7 +229,7 @@ def _pictures(folder, name, size):
     }
 
 
-def scenes(folder, btf, quick, progress):
+def scenes(folder: Path, btf: SampledBTF | None, quick: bool, progress: Progress) -> Facts:
     """What each shipped scene needs, and what its maps then cost to keep, to load and to look up."""
     from btfref.bench.data import checker
     from btfref.registry import method
@@ -228,7 +247,9 @@ def scenes(folder, btf, quick, progress):
     whole = {key: load(path) for key, path in paths.items()}
     size, rounds = ((32, 32), 1) if quick else ((256, 256), 5)
     shown = [name for name in SCENES if not quick or name in QUICK_SCENES]
-    found, turns = {}, list(itertools.product(shown, paths))
+    found: Facts = {}
+    shared: Demand | None = None
+    turns = list(itertools.product(shown, paths))
     for number, (name, key) in enumerate(turns):
         progress(number, len(turns), name)
         scene, fixed, frames = SCENES[name]
@@ -239,30 +260,27 @@ def scenes(folder, btf, quick, progress):
             shared, found[name] = None, {"methods": {}}
         # What a scene needs depends on the method only where lookups leave their texture coordinates.
         elsewhere = isinstance(whole[key], SeesTexels)
-        one = None if elsewhere else shared
-        if one is None:
-            for step in steps:
-                parameters = fixed | step | {"btf": str(path)}
-                (some,) = demand(file, parameters=parameters, grid=1 if quick else 2, size=size).values()
-                one = some if one is None else one | some
+        if shared is None or elsewhere:
+            own = [
+                next(iter(demand(file, parameters=settings, grid=1 if quick else 2, size=size).values()))
+                for settings in (fixed | step | {"btf": str(path)} for step in steps)
+            ]
+            one = reduce(operator.or_, own)
             shared = shared if elsewhere else one
+        else:
+            one = shared
         one = replace(one, file=str(path))
         kept, entry = choice(one), found[name]
         entry.setdefault("shares", {what: n / m for what, (n, m) in one.shares().items()})
-        times = interleaved(
-            {
-                "all": lambda path=path: load(path),
-                "needed": lambda path=path, kept=kept: load(path, **kept),
-            },
-            rounds,
-        )
-        some = load(path, **kept)
+        load_all, load_needed = partial(load, path), partial(load, path, **kept)
+        times = interleaved({"all": load_all, "needed": load_needed}, rounds)
+        some = load_needed()
         parameters = fixed | steps[-1] | {"btf": str(path)}
         entry["methods"][key] = {
             "bytes": _payload(some) / _payload(whole[key]),
             "read": _bytes_read(path, kept) / path.stat().st_size,
             "load": summary(times, "all")["needed"],
-            "memory": _memory(lambda path=path, kept=kept: load(path, **kept), lambda path=path: load(path)),
+            "memory": _memory(load_needed, load_all),
             "frame": _frames(file, parameters, whole[key], some, size, rounds),
             "raw": times,
             "maps": {what: n / m for what, (n, m) in maps_needed(one, whole[key]).maps.items()},
@@ -270,7 +288,14 @@ def scenes(folder, btf, quick, progress):
     return found
 
 
-def _frames(file, parameters, whole, some, size, rounds):
+def _frames(
+    file: PathLike,
+    parameters: Facts,
+    whole: Representation,
+    some: Representation,
+    size: tuple[int, int],
+    rounds: int,
+) -> dict[str, float] | None:
     """Times of real-time frames with the needed maps alone over those with all, in turn.
 
     None with an environment, whose light comes from tables that are made of all maps.
@@ -282,7 +307,7 @@ def _frames(file, parameters, whole, some, size, rounds):
     if scene.environment is not None:
         return None
     with Renderer(scene, lambda path: whole) as first, Renderer(scene, lambda path: some) as second:
-        times = {"all": [], "needed": []}
+        times: dict[str, list[float]] = {"all": [], "needed": []}
         for number in range(rounds + 1):
             for name, renderer in (("all", first), ("needed", second)):
                 seconds = 1e-3 * renderer.draw()
@@ -291,7 +316,7 @@ def _frames(file, parameters, whole, some, size, rounds):
     return summary(times, "all")["needed"]
 
 
-def _memory(needed, whole):
+def _memory(needed: Callable[[], object], whole: Callable[[], object]) -> float | None:
     """Peak memory of a loading over that of the other one; None where the system does not tell."""
     peaks = []
     for task in (needed, whole):
@@ -300,36 +325,37 @@ def _memory(needed, whole):
         after = peak_memory()
         del held
         peaks.append(None if before is None or after is None else max(after - before, 0))
-    return peaks[0] / peaks[1] if all(peaks) else None
+    part, all_of_it = peaks
+    return part / all_of_it if part and all_of_it else None
 
 
-def _bytes_read(path, kept):
+def _bytes_read(path: Path, kept: Facts) -> int:
     """Bytes of a file that loading a choice reads: all where rows and parts of their own are not worth it."""
     from btfref.representations.file.container import bytes_of_choice
 
     return bytes_of_choice(path, kept)
 
 
-def _payload(representation):
+def _payload(representation: Representation) -> int:
     """Bytes of the maps without direction tables."""
     return sum(
         a.nbytes for name, a in representation.arrays().items() if not name.startswith(("view_", "light_"))
     )
 
 
-def _bytes(path):
+def _bytes(path: Path) -> int:
     return sum(entry.stat().st_size for entry in path.rglob("*") if entry.is_file())
 
 
-def _spread(entry, digits=0):
+def _spread(entry: Mapping[str, float], digits: int = 0) -> str:
     """Median ratio with its extremes, in percent."""
     middle, least, most = (f"{100 * entry[name]:.{digits}f}" for name in ("ratio", "ratio_min", "ratio_max"))
     return f"{middle} % ({least} … {most})"
 
 
-def table(result):
+def table(result: Facts) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Rows for people: what is needed of what, and what it costs."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     if one := result.get("synthesis"):
         for name, part in one["parts"].items():
             what = "synthesis: " + (f"of what {name} needs" if name in TRACED else name)

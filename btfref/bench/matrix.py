@@ -10,8 +10,10 @@ from __future__ import annotations
 import json
 import tempfile
 import uuid
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,10 +22,17 @@ from btfref.bench.data import materials
 from btfref.bench.subjects import build
 from btfref.bench.timing import machine
 
+if TYPE_CHECKING:
+    from btfref.bench.plan import Entry, Plan
+    from btfref.bench.subjects import Built
+    from btfref.sampling import SampledBTF
+    from btfref.types import Facts, PathLike, Progress
+
+
 RESULTS = "results.jsonl"
 
 
-def run(plan, out, *, btf=None, progress=None):
+def run(plan: Plan, out: PathLike, *, btf: SampledBTF | None = None, progress: Progress | None = None) -> str:
     """Measure what a plan says.
 
     Parameters
@@ -63,11 +72,11 @@ def run(plan, out, *, btf=None, progress=None):
 class _Writer:
     """Adds records to a folder as they come: what was measured survives an interruption."""
 
-    def __init__(self, folder, plan):
+    def __init__(self, folder: Path, plan: Plan) -> None:
         self.folder = folder
         for sub in ("queries", "values"):
             (folder / sub).mkdir(parents=True, exist_ok=True)
-        self.run = {
+        self.run: Facts = {
             "record": "run",
             "id": uuid.uuid4().hex[:12],
             "started": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -75,46 +84,46 @@ class _Writer:
             "machine": machine(),
         }
 
-    def header(self):
+    def header(self) -> None:
         self._line(self.run)
 
-    def add(self, kind, material, entry, record):
+    def add(self, kind: str, material: str, entry: Entry, record: Facts) -> None:
         described = {"entry": entry.name, "method": entry.method, "peer": entry.peer, "build": entry.build}
         if entry.bytes_of:
             described["bytes_of"] = entry.bytes_of
         self._line({"record": kind, "run": self.run["id"], "material": material, **described, **record})
 
-    def plain(self, kind, material, record):
+    def plain(self, kind: str, material: str, record: Facts) -> None:
         self._line({"record": kind, "run": self.run["id"], "material": material, "plain": True, **record})
 
-    def queries(self, material, arrays):
+    def queries(self, material: str, arrays: Mapping[str, Any]) -> str:
         name = f"queries/{self.run['id']}-{material}.npz"
         np.savez(self.folder / name, **arrays)
         return name
 
-    def values(self, array):
+    def values(self, array: np.ndarray) -> str:
         name = f"values/{uuid.uuid4().hex[:12]}.npy"
         np.save(self.folder / name, np.asarray(array, np.float32))
         return name
 
-    def _line(self, record):
+    def _line(self, record: Facts) -> None:
         with (self.folder / RESULTS).open("a") as stream:
             stream.write(json.dumps(record) + "\n")
 
 
-def _material(plan, name, btf, writer, progress):
+def _material(plan: Plan, name: str, btf: SampledBTF, writer: _Writer, progress: Progress | None) -> None:
     rng = np.random.default_rng(plan.seed)
     queries = measures.sample_queries(btf, plan.settings["error_samples"], rng)
     asked = writer.queries(name, queries)
     total = len(plan.entries) * (plan.rounds["build"] + len(plan.measures) - 1)
     steps = iter(range(total + 1))
 
-    def report(label):
+    def report(label: str) -> None:
         if progress:
             progress(next(steps, total), total, f"{name}: {label}")
 
-    def maker(entry):
-        def make(built):
+    def maker(entry: Entry) -> Callable[[dict[str, Built]], Built]:
+        def make(built: dict[str, Built]) -> Built:
             payload = built[entry.bytes_of].payload if entry.bytes_of else None
             return build(entry, btf, seed=plan.seed, payload=payload)
 
@@ -131,7 +140,7 @@ def _material(plan, name, btf, writer, progress):
             path = paths[entry.name]
             more = {"file_bytes": path.stat().st_size if path else None}
             writer.add("build", name, entry, {**records[entry.name], **more})
-        own = [(entry, paths[entry.name]) for entry in plan.entries if paths[entry.name]]
+        own = [(entry, path) for entry in plan.entries if (path := paths[entry.name]) is not None]
         if "error" in plan.measures:
             for entry in plan.entries:
                 report(f"error of {entry.name}")
@@ -146,11 +155,11 @@ def _material(plan, name, btf, writer, progress):
         built.clear()
         if "render" in plan.measures:
             report("pictures")
-            for entry, record in measures.measure_render(own, btf, plan):
-                if entry is None:
+            for shown, record in measures.measure_render(own, btf, plan):
+                if shown is None:
                     writer.plain("render", name, record)
                 else:
-                    writer.add("render", name, entry, record)
+                    writer.add("render", name, shown, record)
         for kind, measure in (
             ("sampling", measures.measure_sampling),
             ("realtime", measures.measure_realtime),
@@ -162,7 +171,7 @@ def _material(plan, name, btf, writer, progress):
                         writer.add(kind, name, entry, record)
 
 
-def _has_cuda():
+def _has_cuda() -> bool:
     import drjit as dr
 
     return dr.has_backend(dr.JitBackend.CUDA)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import gc
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -25,10 +25,15 @@ if TYPE_CHECKING:
     from btfref.bench.plan import Entry, Plan
     from btfref.bench.subjects import Built
     from btfref.representations.protocol import Representation
-    from btfref.types import Facts, PathLike
+    from btfref.sampling import SampledBTF
+    from btfref.types import Facts, JitArray, PathLike
 
 
-def timed_builds(makes, rounds, report=lambda name: None):
+def timed_builds(
+    makes: Mapping[str, Callable[[dict[str, Built]], Built]],
+    rounds: int,
+    report: Callable[[str], object] = lambda name: None,
+) -> tuple[dict[str, Built], dict[str, Facts]]:
     """Build every entry in each round, in turn.
 
     Parameters
@@ -46,7 +51,8 @@ def timed_builds(makes, rounds, report=lambda name: None):
     records : dict of str to dict
         ``peak_bytes``: how far the process grew beyond what it held before; None where the system does not tell.
     """
-    built, records = {}, {}
+    built: dict[str, Built] = {}
+    records: dict[str, Facts] = {}
     for i in range(rounds):
         for name, make in makes.items():
             report(name)
@@ -68,7 +74,7 @@ def timed_builds(makes, rounds, report=lambda name: None):
     return built, records
 
 
-def sample_queries(btf, n, rng):
+def sample_queries(btf: SampledBTF, n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Random measured entries of a BTF, to be asked of every representation.
 
     Parameters
@@ -110,7 +116,7 @@ def measure_eval(
         reference = None
         for name in known:
             # A peer is asked for values alone.
-            subject = evaluator(name, built.representation or cast("Representation", built), path, **query)
+            subject = evaluator(name, cast("Representation", built.representation or built), path, **query)
             with subject.prepare(*points[name]) as evaluation:
                 cold, facts = _cold(evaluation.run, EVALUATORS[name].compiles)
                 times = interleaved({name: evaluation.run}, plan.rounds["eval"])[name]
@@ -151,7 +157,9 @@ def random_points(n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndar
     return rng.random((n, 2), np.float32), hemisphere(rng, n), hemisphere(rng, n)
 
 
-def measure_render(subjects, btf, plan):
+def measure_render(
+    subjects: Sequence[tuple[Entry, PathLike]], btf: SampledBTF, plan: Plan
+) -> Iterator[tuple[Entry | None, Facts]]:
     """Pictures of equal samples: every build in turn with the baseline, and the first with the other plain materials.
 
     A kernel calls the materials that are alive, whether its scene shows them or not: with all methods alive, each
@@ -170,7 +178,9 @@ def measure_render(subjects, btf, plan):
         half the squared difference of two, ``mean`` that of the radiance; ``baseline_s`` of an entry are the
         baseline's times in its rounds.
     """
-    plain = {name: (None, {}, bsdf) for name, bsdf in scenes.plain_materials(btf).items()}
+    plain: dict[str, tuple[Entry | None, Facts, Facts]] = {
+        name: (None, {}, bsdf) for name, bsdf in scenes.plain_materials(btf).items()
+    }
     groups = [(entry, path, query) for entry, path in subjects for query in entry.query]
     for scene in plan.settings["scenes"]:
         for number, (entry, path, query) in enumerate(groups):
@@ -185,11 +195,14 @@ def measure_render(subjects, btf, plan):
                     yield own, records[key]
 
 
-def _rendered(materials, scene, plan):
+def _rendered(
+    materials: Mapping[str, tuple[Entry | None, Facts, Facts]], scene: str, plan: Plan
+) -> dict[str, Facts]:
     """Records of materials in one scene, in turn."""
     import mitsuba as mi
 
-    tasks, pictures, cold = {}, {}, {}
+    tasks, cold = {}, {}
+    pictures: dict[str, list[np.ndarray]] = {}
     for name, (_, _, bsdf) in materials.items():
         loaded = mi.load_dict(scenes.scene(scene, bsdf, size=plan.settings["render_size"]))
         render = scenes.render_task(loaded, plan.settings["render_spp"])
@@ -220,7 +233,7 @@ def _rendered(materials, scene, plan):
     return result
 
 
-def measure_sampling(entry, path, plan):
+def measure_sampling(entry: Entry, path: PathLike, plan: Plan) -> Iterator[Facts]:
     """Light directions by the data against cosine-distributed ones: variance and time of the same picture.
 
     A sphere in a constant sky, light from the material's samples alone.
@@ -256,7 +269,7 @@ def measure_sampling(entry, path, plan):
             }
 
 
-def measure_realtime(entry, path, plan):
+def measure_realtime(entry: Entry, path: PathLike, plan: Plan) -> Iterator[Facts]:
     """Frame times of the shipped cloth in GLSL: timer or wall clock, whichever is longer.
 
     Yields
@@ -279,7 +292,7 @@ def measure_realtime(entry, path, plan):
             yield {"query": query, "size": list(size), "cold_s": cold, "warm_s": times}
 
 
-def saved(built, entry, folder):
+def saved(built: Built, entry: Entry, folder: PathLike) -> Path | None:
     """File of a build, or None for a peer."""
     if built.representation is None:
         return None
@@ -291,7 +304,7 @@ def saved(built, entry, folder):
     return Path(handle.name)
 
 
-def _cold(task, jit):
+def _cold(task: Callable[[], object], jit: bool) -> tuple[float, Facts]:
     """Seconds of the first call, and what its kernels took where there are any."""
     facts = []
     start = time.perf_counter()
@@ -303,8 +316,8 @@ def _cold(task, jit):
     return seconds, {"kernels": facts[0]} if facts else {}
 
 
-def _keeping(render, pictures):
-    def task():
+def _keeping(render: Callable[[], JitArray], pictures: list[np.ndarray]) -> Callable[[], None]:
+    def task() -> None:
         image = render()
         if len(pictures) < 2:
             pictures.append(np.array(image))

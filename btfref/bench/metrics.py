@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import json
 import statistics
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,11 +17,15 @@ from btfref.bench.matrix import RESULTS
 from btfref.bench.scenes import BASELINE
 from btfref.errors import InputError
 
+if TYPE_CHECKING:
+    from btfref.types import Facts, PathLike
+
+
 #: Half-width of a 99 % interval in standard errors.
 Z99 = 2.5758
 
 
-def read_records(folder):
+def read_records(folder: PathLike) -> list[Facts]:
     """The records of a folder.
 
     Parameters
@@ -52,7 +58,7 @@ def read_records(folder):
     return records
 
 
-def latest(records):
+def latest(records: list[Facts]) -> list[Facts]:
     """Of each plan and material the records of the last run that measured it, and these runs."""
     plan = {r["id"]: r["plan"]["name"] for r in records if r["record"] == "run"}
     # Later runs replace earlier ones.
@@ -62,23 +68,21 @@ def latest(records):
     ]
 
 
-def _is_last(record, plan, last):
+def _is_last(record: Facts, plan: Mapping[str, str], last: Mapping[tuple[str, str], str]) -> bool:
     return last[plan[record["run"]], record["material"]] == record["run"]
 
 
-def spread(times):
-    """Median and extremes of times in seconds, or None for none."""
-    if not times:
-        return None
+def spread(times: Sequence[float]) -> Facts:
+    """Median and extremes of times in seconds, one or more."""
     return {"median": statistics.median(times), "min": min(times), "max": max(times), "n": len(times)}
 
 
-def time_of(record):
+def time_of(record: Facts) -> Facts:
     """Spread of the warm times; of the cold one where no other was taken."""
-    return spread(record["warm_s"]) or spread([record["cold_s"]])
+    return spread(record["warm_s"] or [record["cold_s"]])
 
 
-def paired_ratio(record, baseline):
+def paired_ratio(record: Facts, baseline: Facts) -> Facts:
     """Median and extremes of the ratios of the rounds of two records that took turns."""
     pairs = list(zip(record["warm_s"], baseline["warm_s"], strict=False))
     if not pairs:
@@ -86,7 +90,7 @@ def paired_ratio(record, baseline):
     return spread([a / b for a, b in pairs])
 
 
-def errors(folder, record):
+def errors(folder: PathLike, record: Facts) -> Facts:
     """Errors of the answers to random entries of a BTF.
 
     Parameters
@@ -126,17 +130,17 @@ def errors(folder, record):
     }
 
 
-def _root_ratio(top, bottom):
+def _root_ratio(top: np.ndarray, bottom: np.ndarray) -> tuple[float, float, float]:
     """√(mean top / mean bottom) and the ends of its 99 % interval, from pairs of samples."""
     if not bottom.any():
         return 0.0, 0.0, 0.0
     ratio = top.mean() / bottom.mean()
     error = (top - ratio * bottom).std(ddof=1) / np.sqrt(len(top)) / bottom.mean()
-    ends = ratio - Z99 * error, ratio, ratio + Z99 * error
-    return tuple(float(np.sqrt(max(0.0, x))) for x in ends)
+    low, middle, high = (float(np.sqrt(max(0.0, ratio + z * error))) for z in (-Z99, 0, Z99))
+    return low, middle, high
 
 
-def rows(folder, records=None):
+def rows(folder: PathLike, records: list[Facts] | None = None) -> list[Facts]:
     """Metrics of all records, grouped by what they are of.
 
     Parameters

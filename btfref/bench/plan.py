@@ -8,10 +8,16 @@ from __future__ import annotations
 
 import itertools
 import tomllib
+from collections.abc import Collection, Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from btfref.errors import InputError
+
+if TYPE_CHECKING:
+    from btfref.types import Facts, PathLike
+
 
 #: Shipped plans, and folders of users alike, hold files of this kind.
 SUFFIX = ".toml"
@@ -28,7 +34,7 @@ DATA = {
     "estimator": "surface",
 }
 ROUNDS = {"build": 1, "eval": 5, "render": 5, "sampling": 5, "realtime": 5}
-SETTINGS = {
+SETTINGS: Facts = {
     "error_samples": 50_000,
     "points": {"numpy": 1 << 14, "drjit": 1 << 20, "glsl": 1 << 18},
     "scenes": ["sphere, suns", "cloth, sky"],
@@ -77,8 +83,8 @@ class Entry:
     name: str
     method: str = ""
     peer: str = ""
-    build: dict = field(default_factory=dict)
-    query: tuple = ({},)
+    build: Facts = field(default_factory=dict)
+    query: tuple[Facts, ...] = ({},)
     bytes_of: str = ""
 
 
@@ -92,25 +98,25 @@ class Plan:
     name: str
     title: str
     baseline: str
-    measures: tuple
+    measures: tuple[str, ...]
     seed: int
-    data: dict
-    rounds: dict
-    settings: dict
-    entries: tuple
+    data: Facts
+    rounds: dict[str, int]
+    settings: Facts
+    entries: tuple[Entry, ...]
 
-    def to_dict(self):
+    def to_dict(self) -> Facts:
         """JSON-able copy."""
         return asdict(self)
 
 
-def shipped():
+def shipped() -> dict[str, Path]:
     """Plans of the package: name -> path."""
     folder = Path(__file__).parent / "suites"
     return {path.stem: path for path in sorted(folder.glob(f"*{SUFFIX}"))}
 
 
-def read_plan(path, *, quick=False, only=None):
+def read_plan(path: PathLike, *, quick: bool = False, only: Iterable[str] | None = None) -> Plan:
     """Read a plan.
 
     Parameters
@@ -167,13 +173,13 @@ def read_plan(path, *, quick=False, only=None):
     )
 
 
-def _entries(found, path):
+def _entries(found: Facts, path: PathLike) -> list[Entry]:
     from btfref.bench.subjects import PEERS
     from btfref.registry import methods
 
     queries = _combinations(found.get("query", {}), path)
     rows = found.get("method", [{"key": key} for key in methods()])
-    entries = []
+    entries: list[Entry] = []
     for row in rows:
         _known(row, ("key", "name", "build", "query", "bytes_of"), path, "method")
         _known([row.get("key")], methods(), path, "method.key")
@@ -192,14 +198,14 @@ def _entries(found, path):
     return entries
 
 
-def _combinations(table, path):
+def _combinations(table: Facts, path: PathLike) -> tuple[Facts, ...]:
     """All combinations of lists of query parameters."""
     _known(table, ("filter_type",), path, "query")
     lists = [value if isinstance(value, list) else [value] for value in table.values()]
     return tuple(dict(zip(table, values, strict=True)) for values in itertools.product(*lists))
 
 
-def _known(words, allowed, path, field_name):
+def _known(words: Iterable[Any], allowed: Collection[Any], path: PathLike, field_name: str) -> None:
     unknown = [str(word) for word in words if word not in allowed]
     if unknown:
         raise InputError(

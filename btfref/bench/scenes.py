@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from btfref.sampling import SampledBTF
+    from btfref.types import Facts, JitArray, PathLike
+
 
 #: What stands in for a BTF where none is at hand: one BRDF with a coloured texture.
 BASELINE = "principled + bitmap"
@@ -15,12 +23,12 @@ SHAPES = {"sphere": ((0, -4, 1), 30), "cloth": ((0.6, -2.6, 2.0), 45)}
 LIGHTS = ("sky", "suns")
 
 
-def names():
+def names() -> list[str]:
     """All scenes: a bare sphere, where nothing but shading costs, and the shipped cloth, each under two lights."""
     return [f"{shape}, {light}" for shape in SHAPES for light in LIGHTS]
 
 
-def scene(name, bsdf, *, size, integrator=None):
+def scene(name: str, bsdf: Facts, *, size: int, integrator: Facts | None = None) -> Facts:
     """A scene as Mitsuba's dictionary.
 
     Parameters
@@ -41,11 +49,12 @@ def scene(name, bsdf, *, size, integrator=None):
     kind, light = name.split(", ")
     origin, fov = SHAPES[kind]
     if kind == "sphere":
-        shape = {"type": "sphere", "bsdf": bsdf}
+        shape: Facts = {"type": "sphere", "bsdf": bsdf}
     else:
         # Mitsuba evaluates both sides of a ``twosided`` material: only where the back can be seen.
         mesh = scene_file("cloth").with_name("cloth.ply")
         shape = {"type": "ply", "filename": str(mesh), "bsdf": {"type": "twosided", "bsdf": bsdf}}
+    emitters: Facts
     if light == "sky":
         emitters = {"sky": {"type": "constant"}}
     else:
@@ -72,7 +81,7 @@ def scene(name, bsdf, *, size, integrator=None):
     }
 
 
-def btf_material(path, query, **parameters):
+def btf_material(path: PathLike, query: Mapping[str, object], **parameters: object) -> Facts:
     """The plugin with a file."""
     import mitsuba as mi
 
@@ -80,7 +89,7 @@ def btf_material(path, query, **parameters):
     return {"type": "btf", "filename": str(path), "to_uv": to_uv, **query, **parameters}
 
 
-def plain_materials(btf):
+def plain_materials(btf: SampledBTF) -> dict[str, Facts]:
     """What a user would take instead: name -> dictionary, with the top view under the top light as an albedo.
 
     A texture of the same size and contrast as the BTF.
@@ -89,7 +98,7 @@ def plain_materials(btf):
 
     albedo = np.clip(btf.values[0, 0].astype(np.float32) * np.pi, 0, 1)
 
-    def bitmap():
+    def bitmap() -> Facts:
         to_uv = mi.ScalarTransform4f().scale([TILING, TILING, 1])
         return {
             "type": "bitmap",
@@ -105,14 +114,14 @@ def plain_materials(btf):
     }
 
 
-def render_task(loaded, spp):
+def render_task(loaded: JitArray, spp: int) -> Callable[[], JitArray]:
     """A call that renders a loaded scene once more, with another seed, and returns the picture (H, W, 3)."""
     import drjit as dr
     import mitsuba as mi
 
     seeds = iter(range(1 << 30))
 
-    def render():
+    def render() -> JitArray:
         # An opaque seed: a literal one would compile the kernel anew.
         image = mi.render(loaded, spp=spp, seed=dr.opaque(mi.UInt32, next(seeds)))
         dr.eval(image)

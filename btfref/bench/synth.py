@@ -16,15 +16,23 @@ import statistics
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from btfref.bench.data import MESOSTRUCTURES
 from btfref.bench.synth_methods import MAX_DEPTH, NAIVE_PAIRS, PAIRS, PATH_VIEWS, REFERENCE_SPP
 from btfref.bench.timing import machine
 from btfref.errors import InputError
+
+if TYPE_CHECKING:
+    from btfref.sampling import SampledBTF
+    from btfref.types import Facts, Progress
+
 
 #: Samples of the naive loop and of paths: the classes of equal error.
 SAMPLES = (16, 64)
@@ -44,13 +52,19 @@ GROWTH = {
     "directions": ("5x5", "ubo81", "ubo151"),
     "max_depth": (2, 3, 4, 8),
 }
-BASE = {"mesostructure": "checker", "texels": 64, "directions": "ubo81", "max_depth": 8, "spp": 10}
+BASE: Facts = {"mesostructure": "checker", "texels": 64, "directions": "ubo81", "max_depth": 8, "spp": 10}
 
 #: What a step takes, roughly and in any unit, for the time left: a render of 16 samples, 16 paths, 16 points.
 COST = {"naive": 1, "path": 10, "surface": 10}
 
 
-def run(*, quick=False, progress=None, only=None, btf=None):
+def run(
+    *,
+    quick: bool = False,
+    progress: Progress | None = None,
+    only: Iterable[str] | None = None,
+    btf: SampledBTF | None = None,
+) -> Facts:
     """Time and error of full 64² × 81² synthesis.
 
     Parameters
@@ -85,7 +99,7 @@ def run(*, quick=False, progress=None, only=None, btf=None):
     rounds, texels = (1, 16) if quick else (3, 64)
     count = dict.fromkeys(RUNS, 4) if quick else RUNS
     steps = _Steps(progress, names, settings, rounds, count)
-    result = {"raw": {}, "errors": {}, "means": {}, "reference": {}, "peak_bytes": {}, "kernel_s": {}}
+    result: Facts = {"raw": {}, "errors": {}, "means": {}, "reference": {}, "peak_bytes": {}, "kernel_s": {}}
     with tempfile.TemporaryDirectory() as folder:
         for name in names:
             job = {"mesostructure": name, "texels": texels, "reference": str(Path(folder) / f"{name}.npz")}
@@ -117,15 +131,15 @@ def run(*, quick=False, progress=None, only=None, btf=None):
     return {"suite": "synth", "parameters": parameters, "machine": machine(), "summary": rows, **result}
 
 
-def methods(name):
+def methods(name: str) -> dict[str, tuple[str, int, int]]:
     """Label -> estimator, samples and class of equal error, for one mesostructure."""
     spp = {"naive": SAMPLES, "path": SAMPLES, "surface": POINTS[name]}
     return {f"{key} {n}": (key, n, level) for key, counts in spp.items() for level, n in enumerate(counts)}
 
 
-def _measured(job, rounds, count, steps):
+def _measured(job: Facts, rounds: int, count: Mapping[str, int], steps: _Steps) -> dict[str, Facts]:
     """All methods of one mesostructure in turn: parts of the result by label."""
-    parts = {"raw": {}, "errors": {}, "means": {}, "peak_bytes": {}, "kernel_s": {}}
+    parts: dict[str, Facts] = {"raw": {}, "errors": {}, "means": {}, "peak_bytes": {}, "kernel_s": {}}
     with ExitStack() as stack:
         processes = {}
         for label, (task, spp, _) in methods(job["mesostructure"]).items():
@@ -151,14 +165,21 @@ def _measured(job, rounds, count, steps):
 class _Steps:
     """Steps done of all, weighed by what they take so that the time left can be told from them."""
 
-    def __init__(self, progress, names, settings, rounds, count):
+    def __init__(
+        self,
+        progress: Progress | None,
+        names: Sequence[str],
+        settings: Sequence[Facts],
+        rounds: int,
+        count: Mapping[str, int],
+    ) -> None:
         self.progress, self.done = progress, 0
         self.total = sum(_cost("reference", 0) for _ in names) + sum(_cost("growth", s) for s in settings)
         for name in names:
             self.total += sum(count[task] * _cost(task, spp) for task, spp, _ in methods(name).values())
         self.add(None, 0)
 
-    def add(self, task, what):
+    def add(self, task: str | None, what: Any) -> None:
         """Count a step; the first call shows where it starts."""
         self.done += _cost(task, what) if task else 0
         if self.progress is not None:
@@ -166,7 +187,7 @@ class _Steps:
             self.progress(self.done, self.total, "synthesis")
 
 
-def _cost(task, what):
+def _cost(task: str, what: Any) -> int:
     """Relative time of a step; ``what`` is a number of samples, or a setting of the growth."""
     if task == "reference":
         return 10 * COST["naive"]
@@ -175,9 +196,9 @@ def _cost(task, what):
     return max(1, COST[task] * what // 16)
 
 
-def _growing(quick):
+def _growing(quick: bool) -> list[Facts]:
     """Settings of the growth of the cost."""
-    base = BASE | ({"texels": 16} if quick else {})
+    base: Facts = BASE | ({"texels": 16} if quick else {})
     rows = [base | {"varied": name, name: value} for name, values in GROWTH.items() for value in values]
     return [row for row in rows if not quick or row["texels"] <= 32]
 
@@ -185,7 +206,7 @@ def _growing(quick):
 # --- what is made of the figures
 
 
-def z_limit(significance=SIGNIFICANCE, n_tests=PAIRS):
+def z_limit(significance: float = SIGNIFICANCE, n_tests: int = PAIRS) -> float:
     """|z| that the largest of some standard normals exceeds with a probability (Šidák 1967)."""
     from scipy import special
 
@@ -194,7 +215,7 @@ def z_limit(significance=SIGNIFICANCE, n_tests=PAIRS):
     return float(-special.ndtri(sidak(significance, n_tests) / 2))
 
 
-def bias(runs, reference):
+def bias(runs: ArrayLike, reference: ArrayLike) -> Facts:
     """Deviation of the images' means from the reference's.
 
     Parameters
@@ -237,7 +258,7 @@ def bias(runs, reference):
     }
 
 
-def summary(result):
+def summary(result: Facts) -> list[Facts]:
     """Figures of each mesostructure and method, computed from the raw ones.
 
     Parameters
@@ -282,7 +303,7 @@ def summary(result):
     return rows
 
 
-def table(result):
+def table(result: Facts) -> tuple[list[str], list[list[str]]]:
     """Header and rows for a reader; ratios and seconds are medians with the least and the largest round."""
     header = ["mesostructure", "method", "s", "RMSE", "RMSE w/o 1 %", "MAE"]
     header += [f"|z| ≤ {result['parameters']['z_limit']:.1f}?", "seen from %", "bias %"]
@@ -311,7 +332,7 @@ def table(result):
     return header, rows
 
 
-def _spread(values, form):
+def _spread(values: Sequence[float], form: str) -> str:
     """Median (least … largest), or the one number that there is."""
     middle, low, high = (f"{value:{form}}" for value in values)
     return middle if low == high else f"{middle} ({low} … {high})"
@@ -320,9 +341,9 @@ def _spread(values, form):
 class _Process:
     """A process that does the jobs of one method; see `btfref.bench.synth_methods`."""
 
-    def __init__(self, job):
+    def __init__(self, job: Facts) -> None:
         self._errors = tempfile.TemporaryFile("w+")
-        self._process = subprocess.Popen(
+        process = subprocess.Popen(
             [sys.executable, "-m", "btfref.bench.synth_methods", json.dumps(job)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -330,25 +351,28 @@ class _Process:
             text=True,
             env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         )
+        assert process.stdin is not None
+        assert process.stdout is not None
+        self._process, self._orders, self._answers = process, process.stdin, process.stdout
 
-    def __enter__(self):
+    def __enter__(self) -> _Process:
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self._process.kill()
         self._process.wait()
-        for stream in (self._process.stdin, self._process.stdout, self._errors):
+        for stream in (self._orders, self._answers, self._errors):
             with suppress(BrokenPipeError):  # of a process that failed, which `answer` tells
                 stream.close()
 
-    def answer(self, order=None):
+    def answer(self, order: Facts | None = None) -> Facts:
         """Send an order, if any, and wait for the answer."""
         line = ""
         try:
             if order is not None:
-                self._process.stdin.write(json.dumps(order) + "\n")
-                self._process.stdin.flush()
-            line = self._process.stdout.readline()
+                self._orders.write(json.dumps(order) + "\n")
+                self._orders.flush()
+            line = self._answers.readline()
         except BrokenPipeError:
             pass  # told below
         if not line:

@@ -12,10 +12,20 @@ import os
 import statistics
 import sys
 import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from btfref.numerics.sphere.directions import directions
+
+if TYPE_CHECKING:
+    from btfref.mesostructure.base import Mesostructure
+    from btfref.sampling.paths.texels import TexelPaths
+    from btfref.types import Facts, JitArray
+
 
 #: Pairs at which errors are measured.
 PAIRS = 12
@@ -33,7 +43,7 @@ NAIVE_PAIRS, NAIVE_WARM = 24, 3
 PATH_VIEWS = 8
 
 
-def pairs(n_views, n_lights):
+def pairs(n_views: int, n_lights: int) -> np.ndarray:
     """The pairs at which errors are measured: random, but the same in every run."""
     rng = np.random.default_rng(2003)
     index = rng.choice(n_views * n_lights, PAIRS, replace=False)
@@ -43,7 +53,7 @@ def pairs(n_views, n_lights):
 class Naive:
     """One `mi.render` per pair."""
 
-    def __init__(self, mi, mesostructure, texels):
+    def __init__(self, mi: ModuleType, mesostructure: str, texels: int) -> None:
         from btfref.mesostructure import build
 
         self.mi, self.texels = mi, texels
@@ -55,7 +65,7 @@ class Naive:
         self.parameters = mi.traverse(self.scene)
         self.integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH})
 
-    def __call__(self, view, light, spp, seed):
+    def __call__(self, view: np.ndarray, light: np.ndarray, spp: int, seed: int) -> np.ndarray:
         """Render one pair: (texels, texels, 3) float32."""
         mi = self.mi
         up = [0, 1, 0] if abs(light[1]) < 0.9 else [1, 0, 0]
@@ -67,7 +77,7 @@ class Naive:
         return np.array(image)
 
 
-def _merged(mi, tile, reach):
+def _merged(mi: ModuleType, tile: Mesostructure, reach: int) -> dict[str, JitArray]:
     """All copies of the tile as one mesh per material: the fastest that we know for a plain render."""
     shapes = {}
     offsets = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2), -1).reshape(-1, 2)
@@ -97,7 +107,7 @@ def _merged(mi, tile, reach):
     return shapes
 
 
-def _camera(mi, view, texels):
+def _camera(mi: ModuleType, view: np.ndarray, texels: int) -> JitArray:
     """An orthographic camera sheared so that pixels are the texels' squares on z = 0."""
     matrix = np.eye(4)
     matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = [-0.5, 0, 0], [0, -0.5, 0], -view
@@ -113,7 +123,7 @@ def _camera(mi, view, texels):
     return mi.load_dict({"type": "orthographic", "to_world": mi.ScalarTransform4f(matrix), "film": film})
 
 
-def errors(values, reference, variance):
+def errors(values: np.ndarray, reference: np.ndarray, variance: np.ndarray) -> dict[str, float]:
     """Errors of images (pairs, texels, texels, 3) against a reference with its variance of the same shape."""
     square = (values - reference) ** 2
     kept = np.sort(square.reshape(-1))[: int(0.99 * square.size)]
@@ -124,13 +134,13 @@ def errors(values, reference, variance):
     }
 
 
-class _Subject:
+class _Subject(ABC):
     """A method: ``time(seed)`` tells seconds of a whole BTF, ``images(seed)`` makes the images of the pairs."""
 
-    def __init__(self, mi, job):
+    def __init__(self, mi: ModuleType, job: Facts) -> None:
         from btfref.mesostructure import build
 
-        self.mi, self.job, self.texels, self.spp = mi, job, job["texels"], job.get("spp")
+        self.mi, self.job, self.texels, self.spp = mi, job, job["texels"], job.get("spp", 0)
         self.vectors = directions("ubo81").vectors
         self.tile = build(job["mesostructure"])
         self.pairs = pairs(len(self.vectors), len(self.vectors))
@@ -138,7 +148,15 @@ class _Subject:
         self.lights, self.light = np.unique(self.pairs[:, 1], return_inverse=True)
         self.settings = {"texels": (self.texels,) * 2, "spp": self.spp, "max_depth": MAX_DEPTH}
 
-    def _chosen(self, estimator):
+    @abstractmethod
+    def time(self, seed: int) -> dict[str, float]:
+        """Seconds of a whole BTF, by what takes them."""
+
+    @abstractmethod
+    def images(self, seed: int) -> np.ndarray:
+        """Images of the pairs."""
+
+    def _chosen(self, estimator: Any) -> np.ndarray:
         """Images of the pairs from an estimator of their lights."""
         found = {view: mean for view, mean, _ in estimator.all_views(self.views.tolist())}
         return np.stack(
@@ -149,14 +167,14 @@ class _Subject:
 class NaiveLoop(_Subject):
     """One `mi.render` per pair; its time is extrapolated from random pairs."""
 
-    def __init__(self, mi, job):
+    def __init__(self, mi: ModuleType, job: Facts) -> None:
         super().__init__(mi, job)
         self.render = Naive(mi, job["mesostructure"], self.texels)
 
-    def _some(self, seed):
+    def _some(self, seed: int) -> np.ndarray:
         return np.random.default_rng(seed).integers(0, len(self.vectors), (NAIVE_WARM + NAIVE_PAIRS, 2))
 
-    def time(self, seed):
+    def time(self, seed: int) -> dict[str, float]:
         """Seconds of the loop, and of its kernels alone."""
         import drjit as dr
 
@@ -174,7 +192,7 @@ class NaiveLoop(_Subject):
         parts = {"seconds": times, "kernel_s": kernels}
         return {name: statistics.mean(some[NAIVE_WARM:]) * every for name, some in parts.items()}
 
-    def images(self, seed):
+    def images(self, seed: int) -> np.ndarray:
         """Images of the pairs, with random numbers that neither the reference nor another seed has."""
         first = 100_000 + 100 * seed
         return np.stack(
@@ -188,13 +206,14 @@ class NaiveLoop(_Subject):
 class Reference(NaiveLoop):
     """The same loop with many samples, in rounds whose spread tells its noise."""
 
-    def __init__(self, mi, job):
+    def __init__(self, mi: ModuleType, job: Facts) -> None:
         super().__init__(mi, job)
         self.spp = REFERENCE_SPP // REFERENCE_ROUNDS
 
-    def save(self):
+    def save(self) -> Facts:
         """Write mean and variance of the mean; means of the images of every round."""
-        total, squares, means = 0.0, 0.0, []
+        total = squares = np.zeros(())
+        means = []
         for seed in range(-REFERENCE_ROUNDS, 0):
             images = self.images(seed).astype(np.float64)
             total, squares = total + images, squares + images**2
@@ -208,15 +227,15 @@ class Reference(NaiveLoop):
 class SharedPaths(_Subject):
     """`TexelPaths`, its variances left out; its time is that of some views."""
 
-    def __init__(self, mi, job):
+    def __init__(self, mi: ModuleType, job: Facts) -> None:
         super().__init__(mi, job)
         self.time(0, 2)
 
-    def _made(self, lights, seed):
+    def _made(self, lights: Sequence[int] | np.ndarray, seed: int) -> TexelPaths:
         from btfref.sampling.paths.texels import TexelPaths
 
         class Images(TexelPaths):
-            def _statistics(self, pieces):
+            def _statistics(self, pieces: Sequence[Any]) -> list[tuple[np.ndarray, int]]:
                 import drjit as dr
 
                 mean = (dr.block_sum(self._buffer, self.spp) / self.spp).numpy()
@@ -229,7 +248,7 @@ class SharedPaths(_Subject):
         gc.collect()  # the materials of the scene before would make other kernels
         return Images(self.tile, self.vectors[lights], views=self.vectors, seed=seed, **self.settings)
 
-    def time(self, seed, n_views=PATH_VIEWS):
+    def time(self, seed: int, n_views: int = PATH_VIEWS) -> dict[str, float]:
         """Seconds: those of what is done once, and those of some views times what they stand for."""
         n = len(self.vectors)
         start = time.perf_counter()
@@ -239,7 +258,7 @@ class SharedPaths(_Subject):
             pass
         return {"seconds": made - start + (time.perf_counter() - made) * n / n_views}
 
-    def images(self, seed):
+    def images(self, seed: int) -> np.ndarray:
         """Images of the pairs: what a view gets does not depend on which lights there are."""
         return self._chosen(self._made(self.lights, seed))
 
@@ -247,12 +266,12 @@ class SharedPaths(_Subject):
 class SharedPoints(_Subject):
     """The surface estimator, timed as a whole."""
 
-    def __init__(self, mi, job):
+    def __init__(self, mi: ModuleType, job: Facts) -> None:
         super().__init__(mi, job)
-        self.full = {}
+        self.full: dict[int, np.ndarray] = {}
         self.time(0)
 
-    def time(self, seed):
+    def time(self, seed: int) -> dict[str, float]:
         """Seconds of a whole BTF in memory: images alone, as the naive loop makes them."""
         from btfref.sampling.synthesis import synthesize
 
@@ -265,7 +284,7 @@ class SharedPoints(_Subject):
         self.full[seed] = btf.values[self.pairs[:, 0], self.pairs[:, 1]]
         return {"seconds": seconds}
 
-    def images(self, seed):
+    def images(self, seed: int) -> np.ndarray:
         """Images of the pairs, of the whole BTF where it was made; else points and walks of their directions alone."""
         import drjit as dr
 
@@ -282,10 +301,10 @@ class SharedPoints(_Subject):
         )
 
 
-SUBJECTS = {"naive": NaiveLoop, "path": SharedPaths, "surface": SharedPoints}
+SUBJECTS: dict[str, type[_Subject]] = {"naive": NaiveLoop, "path": SharedPaths, "surface": SharedPoints}
 
 
-def _answers(mi, job):
+def _answers(mi: ModuleType, job: Facts) -> Iterator[Facts]:
     """What a method's process answers: a word when it is ready, then one dict for each order that comes in."""
     subject = SUBJECTS[job["task"]](mi, job)
     with np.load(job["reference"]) as data:
@@ -293,7 +312,7 @@ def _answers(mi, job):
     # Warming up takes both cores: nobody is timed before all are through with it.
     yield {"ready": True}
     for order in map(json.loads, sys.stdin):
-        answer = subject.time(order["seed"]) if order["timed"] else {}
+        answer: Facts = subject.time(order["seed"]) if order["timed"] else {}
         peak = _peak()
         values = subject.images(order["seed"]).astype(np.float64)
         if order["timed"]:
@@ -301,14 +320,14 @@ def _answers(mi, job):
         yield answer | {"means": values.mean((1, 2, 3)).tolist()}
 
 
-def _peak():
+def _peak() -> int:
     """Largest amount of memory that this process had so far, bytes."""
     from btfref.sampling.memory import peak
 
     return peak()
 
 
-def _growth(job):
+def _growth(job: Facts) -> Facts:
     """Time and memory of one setting, results not kept: what a store would be given view by view."""
     from btfref.mesostructure import build
     from btfref.sampling.surface.estimator import SurfaceEstimator
@@ -331,7 +350,7 @@ def _growth(job):
     return {"seconds": seconds, "peak_bytes": _peak(), "n_directions": len(vectors)}
 
 
-def main(job):
+def main(job: Facts) -> None:
     """Carry out a job, with answers on standard output and everything else on standard error."""
     from btfref.sampling.variant import mitsuba_variant
 

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import random
 import statistics
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from btfref.bench.metrics import latest, read_records, rows
 from btfref.report.pareto import Panel, Point, front
+
+if TYPE_CHECKING:
+    from btfref.types import Facts, PathLike
+
 
 #: Relative errors up to this are the rounding of float32 answers.
 REPEATED = 1e-6
@@ -22,7 +28,7 @@ KINDS = {
 }
 
 
-def tables(found):
+def tables(found: list[Facts]) -> list[tuple[str, tuple[str, ...], list[tuple[str, ...]]]]:
     """Tables of metrics.
 
     Parameters
@@ -43,13 +49,13 @@ def tables(found):
     return result
 
 
-def markdown(title, header, lines):
+def markdown(title: str, header: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
     """A table in Markdown, as lines."""
     cells = [header, ["---"] * len(header), *lines]
     return [f"**{title}**", "", *("| " + " | ".join(line) + " |" for line in cells), ""]
 
 
-def panels(found, material):
+def panels(found: list[Facts], material: str) -> list[Panel]:
     """Diagrams of a material: error against bytes, time to fit, and time to evaluate in Dr.Jit and GLSL.
 
     Parameters
@@ -88,14 +94,14 @@ def panels(found, material):
     return result
 
 
-def _short(name):
+def _short(name: str) -> str:
     method, _, described = name.partition(" (")
     return " ".join(
         [method, "×".join(word.split(" ")[-1] for word in described.rstrip(")").split(", "))]
     ).strip()
 
 
-def summary(folder):
+def summary(folder: PathLike) -> Facts:
     """Machine-readable metrics of a folder, with what no other entry beats.
 
     Returns
@@ -114,7 +120,7 @@ def summary(folder):
     return {"runs": [r for r in records if r["record"] == "run"], "metrics": found, "front": fronts}
 
 
-def compared(a, b):
+def compared(a: PathLike, b: PathLike) -> list[Facts]:
     """What two folders have in common, as ratios of the second to the first.
 
     Parameters
@@ -148,15 +154,15 @@ def compared(a, b):
     return result
 
 
-def _raw(folder):
+def _raw(folder: PathLike) -> list[Facts]:
     return [r for r in latest(read_records(folder)) if "warm_s" in r and r.get("way") != "cosine"]
 
 
-def _times(record):
+def _times(record: Facts) -> list[float]:
     return record["warm_s"] or [record["cold_s"]]
 
 
-def _key(r):
+def _key(r: Facts) -> tuple[str, ...]:
     query = r.get("query", "")
     query = " ".join(map(str, query.values())) if isinstance(query, dict) else query
     size = r.get("size", "")
@@ -166,7 +172,9 @@ def _key(r):
     return kind, r["material"], name, query, r.get("evaluator", ""), r.get("scene", ""), size
 
 
-def _bootstrap(x, y, n=2000):
+def _bootstrap(
+    x: Sequence[float], y: Sequence[float], n: int = 2000
+) -> tuple[float, float] | tuple[None, None]:
     """Ends of the 95 % interval of the ratio of two medians, y over x."""
     if len(x) < 2 or len(y) < 2:
         return None, None
@@ -178,7 +186,7 @@ def _bootstrap(x, y, n=2000):
     return ratios[int(0.025 * n)], ratios[int(0.975 * n)]
 
 
-def _span(value, digits="{:.3g}"):
+def _span(value: Facts, digits: str = "{:.3g}") -> str:
     if value["n"] < 2:
         return digits.format(value["median"])
     return (
@@ -186,11 +194,11 @@ def _span(value, digits="{:.3g}"):
     )
 
 
-def _bytes(n):
+def _bytes(n: int | None) -> str:
     return "–" if n is None else f"{n:,}".replace(",", " ")
 
 
-def _new_kernels(facts):
+def _new_kernels(facts: Facts | None) -> str:
     """How many kernels the first call had to compile or load, and what that took."""
     if facts is None:
         return "–"
@@ -254,5 +262,5 @@ _COLUMNS = {
 }
 
 
-def _scaled(value, factor):
+def _scaled(value: Facts, factor: float) -> dict[str, float]:
     return {key: factor * value[key] for key in ("median", "min", "max")}

@@ -6,13 +6,18 @@ import os
 import platform
 import statistics
 import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from btfref.provenance import versions
 from btfref.sampling.memory import of_this_process
 
+if TYPE_CHECKING:
+    from btfref.types import Facts
 
-def machine():
+
+def machine() -> Facts:
     """Facts about the machine that a time depends on."""
     model = platform.processor()
     try:
@@ -29,7 +34,7 @@ def machine():
     }
 
 
-def interleaved(tasks, rounds):
+def interleaved(tasks: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
     """Times of tasks that are run in turn, so that drifts of the machine hit all of them alike.
 
     Parameters
@@ -44,7 +49,7 @@ def interleaved(tasks, rounds):
     dict of str to list of float
         Seconds of each round.
     """
-    times = {name: [] for name in tasks}
+    times: dict[str, list[float]] = {name: [] for name in tasks}
     for i in range(rounds + 1):
         for name, task in tasks.items():
             start = time.perf_counter()
@@ -54,7 +59,7 @@ def interleaved(tasks, rounds):
     return times
 
 
-def summary(times, baseline):
+def summary(times: Mapping[str, Sequence[float]], baseline: str) -> dict[str, dict[str, float]]:
     """Median, extremes, and median ratio of pairs to the ``baseline`` of :func:`interleaved` times."""
     result = {}
     for name, values in times.items():
@@ -70,7 +75,7 @@ def summary(times, baseline):
     return result
 
 
-def kernels(task):
+def kernels(task: Callable[[], object]) -> Facts:
     """Run a task of Dr.Jit and tell what its kernels took, tracing and Python left out.
 
     Parameters
@@ -101,7 +106,7 @@ def kernels(task):
     }
 
 
-def reset_peak():
+def reset_peak() -> int | None:
     """Start counting the peak of the process anew; what it holds now in bytes, or None."""
     try:
         Path("/proc/self/clear_refs").write_text("5")
@@ -110,6 +115,6 @@ def reset_peak():
         return None
 
 
-def peak_memory():
+def peak_memory() -> int | None:
     """Most that the process held since :func:`reset_peak`, bytes, or None."""
     return of_this_process("VmHWM")

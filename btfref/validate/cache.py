@@ -10,19 +10,24 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from btfref.outputs import new_file
 
+if TYPE_CHECKING:
+    from btfref.types import Facts, PathLike
 
-def folder():
+
+def folder() -> Path:
     """Where results are kept: ``BTFREF_CACHE``, else btfref's part of the user's cache."""
     given = os.environ.get("BTFREF_CACHE")
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(given) if given else Path(base) / "btfref"
 
 
-def key_of(facts):
+def key_of(facts: Facts) -> str:
     """A key from JSON-able facts; equal facts, equal key."""
     text = json.dumps(facts, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
@@ -37,19 +42,19 @@ class Cache:
         Default: `folder`.
     """
 
-    def __init__(self, root=None):
+    def __init__(self, root: PathLike | None = None) -> None:
         self.root = Path(root) if root is not None else folder()
 
-    def path(self, key, suffix):
+    def path(self, key: str, suffix: str) -> Path:
         """Name of a result; its folder is there."""
         self.root.mkdir(parents=True, exist_ok=True)
         return (self.root / f"{key}{suffix}").resolve()
 
-    def has(self, key, suffix):
+    def has(self, key: str, suffix: str) -> bool:
         """Whether a result is there, complete."""
         return (self.root / f"{key}{suffix}").exists()
 
-    def write(self, key, suffix, save):
+    def write(self, key: str, suffix: str, save: Callable[[Path], object]) -> Path:
         """Make a result by ``save(path)``; it appears under its name when it is complete.
 
         Returns

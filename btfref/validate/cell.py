@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +25,15 @@ from btfref.validate.cache import key_of
 from btfref.validate.material import fit_key
 from btfref.validate.matrix import ENVIRONMENTS
 from btfref.validate.pictures import fitted, make_views, shared_settings, views_key
+
+if TYPE_CHECKING:
+    from btfref.comparison import Comparison
+    from btfref.rendering.result import RenderResult
+    from btfref.types import Facts
+    from btfref.validate.cache import Cache
+    from btfref.validate.matrix import Settings, Spec
+    from btfref.validate.pictures import Views
+
 
 #: Gates of a picture in real time against the reference under delta lights.
 GATES = (
@@ -45,6 +57,17 @@ COUNTED = (PixelClass.INTERIOR, PixelClass.MESOSTRUCTURE)
 MOST = 1 << 15
 
 
+#: Chain, reference, picture in real time, gates, facts, and parts of stages: ``(name, of, test, reference)``.
+_Chain = tuple[
+    "list[Picture]",
+    "RenderResult",
+    "RenderResult",
+    tuple[str, ...],
+    "Facts",
+    "Sequence[tuple[str, str, np.ndarray, np.ndarray]]",
+]
+
+
 @dataclass(frozen=True, eq=False)
 class CellResult:
     """What a cell of the matrix found.
@@ -60,13 +83,13 @@ class CellResult:
         Of the reference, where it has noise.
     """
 
-    facts: dict
-    images: dict
+    facts: Facts
+    images: dict[str, np.ndarray]
     classes: np.ndarray | None = None
     variance: np.ndarray | None = None
 
     @property
-    def outcome(self):
+    def outcome(self) -> str:
         """``pass``, ``inconclusive`` or ``fail``."""
         outcomes = {gate["outcome"] for gate in self.facts["gates"]}
         if not outcomes or "fail" in outcomes:
@@ -74,11 +97,11 @@ class CellResult:
         return "inconclusive" if "inconclusive" in outcomes else "pass"
 
     @property
-    def gates(self):
+    def gates(self) -> tuple[GateResult, ...]:
         """The gates as `GateResult`."""
         return tuple(gate_from(facts) for facts in self.facts["gates"])
 
-    def comparison(self):
+    def comparison(self) -> Comparison | None:
         """The comparison of both renderers once more, with its maps."""
         keys = self.facts.get("image_gates")
         if not self.images or keys is None:
@@ -92,7 +115,7 @@ class CellResult:
         )
 
 
-def gate_from(facts):
+def gate_from(facts: Facts) -> GateResult:
     """A `GateResult` from its JSON."""
     names = {"class": "pixel_class"}
     values = {names.get(key, key): value for key, value in facts.items()}
@@ -101,7 +124,7 @@ def gate_from(facts):
     return GateResult(**values)
 
 
-def cell_key(spec, settings):
+def cell_key(spec: Spec, settings: Settings) -> str:
     """Key of a cell: its fit, the pictures it shares, the code and the tolerances."""
     return key_of(
         {
@@ -112,7 +135,7 @@ def cell_key(spec, settings):
     )
 
 
-def make_cell(cache, spec, settings):
+def make_cell(cache: Cache, spec: Spec, settings: Settings) -> CellResult:
     """Compute a cell, or read it.
 
     Returns
@@ -130,7 +153,7 @@ def make_cell(cache, spec, settings):
     return read_cell(cache.path(key, ".cell.npz"))
 
 
-def failed_cell(spec, why):
+def failed_cell(spec: Spec, why: str) -> CellResult:
     """A cell whose reference, or whose picture, could not be made: a failure of every gate."""
     keys = GATES if spec.lights not in ENVIRONMENTS else ENVIRONMENT_GATES["lights"]
     gates = [g.to_dict() for key in keys for g in missing_reference(key, why)]
@@ -138,7 +161,7 @@ def failed_cell(spec, why):
     return CellResult(json_safe(facts), {})
 
 
-def read_cell(path):
+def read_cell(path: Path) -> CellResult:
     """A cell from its file."""
     with np.load(path) as stored:
         images = {name[6:]: stored[name] for name in stored.files if name.startswith("image_")}
@@ -146,14 +169,15 @@ def read_cell(path):
         return CellResult(json.loads(str(stored["facts"])), images, stored["classes"], variance)
 
 
-def _save(path, result):
-    images = {f"image_{name}": image for name, image in result.images.items()}
+def _save(path: Path, result: CellResult) -> None:
+    parts: Facts = {f"image_{name}": image for name, image in result.images.items()}
+    parts["classes"] = result.classes
     if result.variance is not None:
-        images["variance"] = result.variance
-    np.savez_compressed(path, facts=json.dumps(result.facts), classes=result.classes, **images)
+        parts["variance"] = result.variance
+    np.savez_compressed(path, facts=json.dumps(result.facts), **parts)
 
 
-def _cell(cache, spec, settings):
+def _cell(cache: Cache, spec: Spec, settings: Settings) -> CellResult:
     from btfref.representations.file.container import read_info
 
     start = time.perf_counter()
@@ -199,7 +223,7 @@ def _cell(cache, spec, settings):
     return CellResult(json_safe(facts), images, views.classes, reference.variance)
 
 
-def _under_deltas(path, spec, views, settings, shared):
+def _under_deltas(path: Path, spec: Spec, views: Views, settings: Settings, shared: Facts) -> _Chain:
     """Chain, reference, picture in real time, gates, facts and parts of stages where nothing is random."""
     from btfref.rendering.gl.renderer import realtime
     from btfref.rendering.offline.approximate import approximate
@@ -213,7 +237,7 @@ def _under_deltas(path, spec, views, settings, shared):
     return [Picture(name, picture[None]) for name, picture in chain], reference, image, GATES, {}, ()
 
 
-def _under_environment(path, spec, views, settings, shared):
+def _under_environment(path: Path, spec: Spec, views: Views, settings: Settings, shared: Facts) -> _Chain:
     """The same under an environment: the reference is traced until its noise decides nothing.
 
     Its four batches are the stage of the fit as well. Real time approximates here, and its port is a part of that
@@ -244,7 +268,7 @@ def _under_environment(path, spec, views, settings, shared):
     return chain, reference, image, gates, facts, parts
 
 
-def eight_bits(image, display):
+def eight_bits(image: np.ndarray, display: Display) -> np.ndarray:
     """What a display of 8 bits shows, as linear radiance: scaled, clipped, coded, decoded.
 
     Parameters
@@ -261,7 +285,7 @@ def eight_bits(image, display):
     return (decode_srgb(codes / 255) / 2.0**display.stops).astype(np.float32)
 
 
-def sampling_noise(views, mask):
+def sampling_noise(views: Views, mask: np.ndarray) -> dict[str, float] | None:
     """How much of the first stage is Monte Carlo noise of the sampled BTF, by its independent twin.
 
     Returns

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Sequence
 from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,7 +13,7 @@ from btfref.comparison import compare
 from btfref.comparison.comparison import agreement
 from btfref.comparison.waterfall import Picture, waterfall
 from btfref.conventions import PixelClass
-from btfref.gates.verdicts import Measured, judge
+from btfref.gates.verdicts import GateResult, Measured, judge
 from btfref.images.display import fit_display
 from btfref.scene.shipped import scene_file
 from btfref.stress.data import bumpy
@@ -21,6 +23,14 @@ from btfref.stress.lookups import USUAL, hard_lookups, hemisphere
 from btfref.validate.cell import ENVIRONMENT_GATES, GATES
 from btfref.validate.method_gates import sampling_gates
 from btfref.validate.own_renderer import EIGHT_BIT, NOISY
+
+if TYPE_CHECKING:
+    from btfref.rendering.result import RenderResult
+    from btfref.representations.protocol import Representation
+    from btfref.sampling import SampledBTF
+    from btfref.types import JitArray
+    from btfref.validate.faults import Fault, Subject
+
 
 #: The picture of the faults of the host: a curved surface seen from both sides, and more than one light.
 SCENE, LIGHTS = "cloth", "directional3"
@@ -33,21 +43,25 @@ ENVIRONMENTS = {"lpca": "bright-texel", "rf_lobes": "constant"}
 CHI2_SAMPLES = 200_000
 
 
+#: What a look at a fault returns.
+Gates = Sequence[GateResult]
+
+
 class Altered:
     """A plugin whose sampling is wrong in one way: ``density``, ``weight`` or ``pdf``."""
 
-    def __init__(self, plugin, change):
+    def __init__(self, plugin: JitArray, change: str) -> None:
         self._plugin, self._change = plugin, change
         self.eval = plugin.eval
 
-    def pdf(self, context, si, w, active=True):
+    def pdf(self, context: JitArray, si: JitArray, w: JitArray, active: JitArray = True) -> JitArray:
         """The density, or that of a view that is turned by half a circle."""
         if self._change == "density":
             si = type(si)(si)
             si.wi.x, si.wi.y = -si.wi.x, -si.wi.y
         return self._plugin.pdf(context, si, w, active)
 
-    def sample(self, context, si, *numbers):
+    def sample(self, context: JitArray, si: JitArray, *numbers: JitArray) -> tuple[JitArray, JitArray]:
         """A sample whose weight, or whose density, is a hundredth too large."""
         bs, weight = self._plugin.sample(context, si, *numbers)
         if self._change == "pdf":
@@ -58,16 +72,19 @@ class Altered:
 class Bench:
     """Where faults are looked for: one small material, fitted when needed."""
 
-    def __init__(self, folder):
+    def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._fits, self._clean, self._references = {}, {}, {}
+        self._fits: dict[Subject, tuple[Representation, Path]] = {}
+        self._clean: dict[tuple[str, Subject], Gates] = {}
+        self._references: dict[Subject, tuple[Path, dict[str, str], np.ndarray, np.ndarray]] = {}
+        self._converged: dict[Subject, tuple[RenderResult, np.ndarray]] = {}
 
     @cached_property
-    def btf(self):
+    def btf(self) -> SampledBTF:
         """The material: a formula with bumps, 16² texels and 81² directions."""
         return bumpy(shape=(16, 16))
 
-    def fit(self, subject):
+    def fit(self, subject: Subject) -> tuple[Representation, Path]:
         """The representation and its file."""
         from btfref.registry import method as row
         from btfref.representations import load, save
@@ -79,14 +96,14 @@ class Bench:
             self._fits[subject] = load(path), path
         return self._fits[subject]
 
-    def clean(self, fault):
+    def clean(self, fault: Fault) -> Gates:
         """The gates without the fault, looked at once."""
         key = fault.look, fault.subject
         if key not in self._clean:
             self._clean[key] = getattr(self, fault.look)(fault.subject)
         return self._clean[key]
 
-    def reference(self, subject):
+    def reference(self, subject: Subject) -> tuple[Path, dict[str, str], np.ndarray, np.ndarray]:
         """Scene, parameters, reference picture and pixel classes."""
         from btfref.rendering.offline.reference import render
         from btfref.scene.pixel_classes import pixel_classes
@@ -99,7 +116,7 @@ class Bench:
             self._references[subject] = scene, parameters, image, classes
         return self._references[subject]
 
-    def picture(self, subject, change=""):
+    def picture(self, subject: Subject, change: str = "") -> Gates:
         """Real time against the reference; the fault without a shader is light where nothing is."""
         from btfref.rendering.gl.renderer import realtime
 
@@ -109,7 +126,7 @@ class Bench:
             image = np.where(classes[..., None] == PixelClass.BACKGROUND, image + 0.01, image)
         return compare(image, expected, classes=classes, gate=GATES, flip=False).gates
 
-    def environment(self, subject, change=""):
+    def environment(self, subject: Subject, change: str = "") -> Gates:
         """Real time under an environment against a converged reference."""
         from btfref.rendering.gl.renderer import realtime
         from btfref.rendering.offline.converged import converged
@@ -120,22 +137,21 @@ class Bench:
         scene, shared = scene_file("sphere"), {"parameters": parameters, "grid": 2, "size": (24, 24)}
         made = realtime(scene, **shared)
         gates = ENVIRONMENT_GATES[made.meta["environment_path"]]
-        key = subject, "environment"
-        if key not in self._references:
+        if subject not in self._converged:
             classes = pixel_classes(scene, **shared)
             found = converged(scene, classes == PixelClass.INTERIOR, gate=gates, shadows=False, **shared)
-            self._references[key] = found, classes
-        (reference, classes), image = self._references[key], made.image.copy()
+            self._converged[subject] = found, classes
+        (reference, classes), image = self._converged[subject], made.image.copy()
         if change == "tile":
             image[8:16, 8:16] *= 1.1
         return compare(image, reference, classes=classes, gate=gates, flip=False).gates
 
-    def sampling(self, subject, change=""):
+    def sampling(self, subject: Subject, change: str = "") -> Gates:
         """Samples of the plugin against its density and its values."""
         altered = (lambda plugin: Altered(plugin, change)) if change else None
         return sampling_gates(self.fit(subject)[1], samples=CHI2_SAMPLES, altered=altered)
 
-    def batches(self, subject, change=""):
+    def batches(self, subject: Subject, change: str = "") -> Gates:
         """A waterfall of one stage from noisy batches; the fault is a batch that is another once more."""
         _, _, expected, classes = self.reference(subject)
         rng, scale = np.random.default_rng(14), float(expected[classes == PixelClass.INTERIOR].mean())
@@ -147,7 +163,7 @@ class Bench:
             chain, classes == PixelClass.INTERIOR, fit_display(expected, classes != PixelClass.BACKGROUND)
         ).gates
 
-    def noisy(self, subject, change=""):
+    def noisy(self, subject: Subject, change: str = "") -> Gates:
         """A picture against a reference with known noise."""
         _, _, expected, classes = self.reference(subject)
         rng, scale = np.random.default_rng(15), float(expected[classes == PixelClass.INTERIOR].mean())
@@ -157,7 +173,7 @@ class Bench:
         variance = np.full(expected.shape, sigma**2)
         return compare(image, reference, classes=classes, gate=NOISY, variance=variance, flip=False).gates
 
-    def probes(self, subject):
+    def probes(self, subject: Subject) -> Gates:
         """The shader against the definition, at all levels of detail where there are any."""
         representation, _ = self.fit(subject)
         lookups = hard_lookups(np.random.default_rng(11), representation, 4000, USUAL)
@@ -167,7 +183,7 @@ class Bench:
             *judge("probe.finite", {"nonfinite": int(np.count_nonzero(~np.isfinite(value)))}),
         ]
 
-    def harmonics(self, subject):
+    def harmonics(self, subject: Subject) -> Gates:
         """The shader under an environment in spherical harmonics against float64."""
         from btfref.rendering.environment_light.lighting import Lighting
         from btfref.rendering.gl.probe import probe_environment
@@ -186,7 +202,7 @@ class Bench:
         value = probe_environment(representation, light, *points)
         return agreement(value, light.radiance(*points), gate="environment.agreement").gates
 
-    def eight_bits(self, subject, change=""):
+    def eight_bits(self, subject: Subject, change: str = "") -> Gates:
         """A picture that went through an 8-bit file; the faults are codes taken for radiance, and a pixel's shift."""
         from btfref.numerics.colour import decode_srgb, encode_srgb
 
@@ -198,14 +214,15 @@ class Bench:
             image = np.roll(image, 1, axis=1)
         return compare(image, shown, classes=classes, gate=EIGHT_BIT, flip=False).gates
 
-    def overflow(self, subject, change=""):
+    def overflow(self, subject: Subject, change: str = "") -> Gates:
         """Maps as halves on their way to the shader; the fault scales them beyond 65504 and lets it happen."""
         representation, _ = self.fit(subject)
         if change:
-            name = max(representation.maps, key=lambda n: representation.maps[n].size)
+            maps = representation.arrays()
+            name = max(maps, key=lambda n: maps[n].size)
             with np.errstate(over="ignore"):
-                large = (representation.maps[name].astype(np.float32) * 1e6).astype(np.float16)
-            representation = dataclasses.replace(representation, maps={**representation.maps, name: large})
+                large = (maps[name].astype(np.float32) * 1e6).astype(np.float16)
+            representation = representation.from_arrays({**maps, name: large}, representation.meta)
         lookups = hard_lookups(np.random.default_rng(13), representation, 2000, USUAL)
         value = evaluator("glsl", representation).evaluate(*lookups.points)
         bad = int(np.count_nonzero(~np.isfinite(value)))

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+#: What is fitted: method, and parameters of the fit.
+Subject = tuple[str, tuple[tuple[str, object], ...]]
+
 
 @dataclass(frozen=True)
 class Fault:
@@ -30,12 +33,12 @@ class Fault:
     meant: str
     look: str
     method: str = "lpca"
-    edit: tuple = ()
+    edit: tuple[()] | tuple[str, str, str] = ()
     change: str = ""
-    parameters: tuple = ()
+    parameters: tuple[tuple[str, object], ...] = ()
 
     @property
-    def subject(self):
+    def subject(self) -> Subject:
         """What is fitted: method and parameters."""
         return self.method, self.parameters
 

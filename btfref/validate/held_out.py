@@ -8,15 +8,24 @@ without compression.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from btfref.numerics.sphere.directions import DirectionSet
+    from btfref.representations.protocol import Representation
+    from btfref.sampling import SampledBTF
+    from btfref.types import Facts
+
 
 #: Pairs of directions that are measured at most; texels are all taken.
 PAIRS = 600
 
 
-def split(directions):
+def split(directions: DirectionSet) -> tuple[np.ndarray, np.ndarray]:
     """Indices of the directions that a fit sees, and of those held out.
 
     Parameters
@@ -37,7 +46,9 @@ def split(directions):
     return np.flatnonzero(kept), np.flatnonzero(~kept)
 
 
-def held_out_error(fit, btf, *, texels, seed=0):
+def held_out_error(
+    fit: Callable[[SampledBTF], Representation], btf: SampledBTF, *, texels: int, seed: int = 0
+) -> Facts:
     """Errors of a fit at the samples that it saw, and at those that it did not.
 
     Parameters
@@ -84,7 +95,9 @@ def held_out_error(fit, btf, *, texels, seed=0):
     return {**found, **{name: [len(a), len(b)] for name, (a, b) in parts.items()}}
 
 
-def _error(representation, btf, values, views, lights):
+def _error(
+    representation: Representation, btf: SampledBTF, values: np.ndarray, views: np.ndarray, lights: np.ndarray
+) -> np.ndarray:
     """Value − sample at texel centres; (pairs, texels, 3)."""
     n_rows, n_columns = values.shape[2:4]
     v, u = np.meshgrid(

@@ -5,22 +5,33 @@ from __future__ import annotations
 import os
 import shutil
 from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from btfref.provenance import code_of
 from btfref.validate.cache import key_of
+
+if TYPE_CHECKING:
+    from btfref.sampling import SampledBTF
+    from btfref.types import Progress
+    from btfref.validate.cache import Cache
+    from btfref.validate.matrix import Settings
+
 
 #: Seeds are apart by this: the twin's samples share no random number with the BTF that is fitted.
 TWIN = 1000
 
 
-def material_key(mesostructure, settings):
+def material_key(mesostructure: str, settings: Settings) -> str:
     """Key of a sampled BTF and its twin."""
     named = ("texels", "directions", "estimator", "spp", "seed")
     facts = {name: getattr(settings, name) for name in named}
     return key_of({"material": mesostructure, **facts, "code": code_of("material")})
 
 
-def make_material(cache, mesostructure, settings, progress=None):
+def make_material(
+    cache: Cache, mesostructure: str, settings: Settings, progress: Progress | None = None
+) -> list[Path]:
     """Synthesize a BTF and its twin, unless they are there.
 
     Returns
@@ -56,20 +67,20 @@ def make_material(cache, mesostructure, settings, progress=None):
 
 
 @lru_cache(maxsize=2)
-def load_material(path):
+def load_material(path: Path) -> SampledBTF:
     """A sampled BTF, kept for the next caller of the same process."""
     from btfref.sampling import SampledBTF
 
     return SampledBTF.load(path, variance=False)
 
 
-def fit_key(mesostructure, method, settings):
+def fit_key(mesostructure: str, method: str, settings: Settings) -> str:
     """Key of a fit."""
     facts = {"fit": method, "material": material_key(mesostructure, settings), "seed": settings.seed}
     return key_of({**facts, "code": code_of("fit", method)})
 
 
-def make_fit(cache, mesostructure, method, settings):
+def make_fit(cache: Cache, mesostructure: str, method: str, settings: Settings) -> Path:
     """Fit a method with its defaults to a material, unless that is done.
 
     Returns

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from btfref.errors import InputError
 from btfref.registry import methods
 from btfref.scene.shipped import scene_file
+
+if TYPE_CHECKING:
+    from btfref.types import Facts
+
 
 #: Scenes that show a BTF on a shape of their own: flat, curved, folded and seen from both sides.
 SCENES = ("plane", "sphere", "cloth")
@@ -43,12 +50,12 @@ class Spec:
     lights: str
 
     @property
-    def name(self):
+    def name(self) -> str:
         """For people, and unique."""
         return f"{self.method} · {self.scene} · {self.lights} · {self.mesostructure}"
 
     @property
-    def slug(self):
+    def slug(self) -> str:
         """The same for files."""
         return "-".join((self.mesostructure, self.method, self.scene, self.lights))
 
@@ -101,15 +108,15 @@ class Settings:
     chi2_samples: int = 1_000_000
     seed: int = 0
 
-    def edge(self, lights):
+    def edge(self, lights: str) -> int:
         """Edge of the pictures under some lights, in pixels."""
         return self.environment_size if lights in ENVIRONMENTS else self.size
 
-    def cells(self, lights):
+    def cells(self, lights: str) -> int:
         """Sub-pixels per axis under some lights."""
         return self.environment_grid if lights in ENVIRONMENTS else self.grid
 
-    def to_dict(self):
+    def to_dict(self) -> Facts:
         """JSON-able form."""
         return asdict(self)
 
@@ -126,7 +133,14 @@ QUICK = replace(
 )
 
 
-def select(*, only=None, scenes=None, lights=None, mesostructures=None, quick=False):
+def select(
+    *,
+    only: Sequence[str] | None = None,
+    scenes: Sequence[str | Path] | None = None,
+    lights: Sequence[str] | None = None,
+    mesostructures: Sequence[str] | None = None,
+    quick: bool = False,
+) -> list[Spec]:
     """The cells of a run.
 
     Parameters
@@ -163,7 +177,7 @@ def select(*, only=None, scenes=None, lights=None, mesostructures=None, quick=Fa
     return sorted(Spec(m, key, scene, light) for m in materials for key in keys for scene, light in views)
 
 
-def _known(what, given, known):
+def _known(what: str, given: Iterable[str] | None, known: Collection[str]) -> None:
     for name in given or ():
         if name not in known:
             raise InputError(f"unknown {what}", got=repr(name), expected=f"one of {', '.join(known)}")

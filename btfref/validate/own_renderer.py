@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +15,11 @@ from btfref.images import load_image
 from btfref.provenance import code_of
 from btfref.scene.shipped import scene_file
 from btfref.validate.cache import Cache, key_of
+
+if TYPE_CHECKING:
+    from btfref.comparison import Comparison
+    from btfref.types import Facts, PathLike
+
 
 #: Gates of a picture of linear radiance under delta lights; of one with 8 bits; of one under an environment.
 LINEAR = ("image.noise_free", "image.silhouette", "image.mesostructure", "image.background")
@@ -43,7 +50,16 @@ class Reference:
     cached: bool = False
 
 
-def reference_of(scene, *, parameters=None, size=None, grid=4, shadows=False, spp=SPP, cache=None):
+def reference_of(
+    scene: PathLike,
+    *,
+    parameters: Mapping[str, str] | None = None,
+    size: tuple[int, int] | None = None,
+    grid: int = 4,
+    shadows: bool = False,
+    spp: int = SPP,
+    cache: PathLike | None = None,
+) -> Reference:
     """The reference picture of a scene, rendered once.
 
     Parameters
@@ -97,26 +113,40 @@ def reference_of(scene, *, parameters=None, size=None, grid=4, shadows=False, sp
         return Reference(stored["image"], stored["classes"], variance, there)
 
 
-def _render(path, parameters, size, grid, shadows, spp, delta):
+def _render(
+    path: Path,
+    parameters: Mapping[str, str],
+    size: tuple[int, int] | None,
+    grid: int,
+    shadows: bool,
+    spp: int,
+    delta: bool,
+) -> Facts:
     from btfref.rendering.offline.reference import render
     from btfref.scene.pixel_classes import pixel_classes
 
     shared = {"parameters": parameters, "size": size}
-    made = {"classes": pixel_classes(path, grid=grid, **shared)}
+    made: Facts = {"classes": pixel_classes(path, grid=grid, **shared)}
     if delta:
         return made | {"image": render(path, grid=grid, shadows=shadows, **shared).image}
     result = render(path, spp=spp, with_variance=True, **shared)
     return made | {"image": result.image, "variance": result.variance}
 
 
-def _digest(name):
+def _digest(name: PathLike) -> str:
     import hashlib
 
     with open(name, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def judge_image(image, reference, *, gates=None, flip=True):
+def judge_image(
+    image: PathLike | np.ndarray,
+    reference: Reference,
+    *,
+    gates: str | Sequence[str] | None = None,
+    flip: bool = True,
+) -> Comparison:
     """Compare a picture with a reference by the gates that fit it.
 
     Parameters
@@ -154,7 +184,9 @@ def judge_image(image, reference, *, gates=None, flip=True):
     )
 
 
-def representation_for(method, btf=None, *, cache=None):
+def representation_for(
+    method: PathLike, btf: PathLike | None = None, *, cache: PathLike | None = None
+) -> Path:
     """A file of a method: the file itself, or the key of a method that is fitted to a sampled BTF, once.
 
     Parameters

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,8 +14,14 @@ from btfref.validate.cache import key_of
 from btfref.validate.material import fit_key, load_material, make_fit, make_material, material_key
 from btfref.validate.matrix import ENVIRONMENTS, LIGHTS
 
+if TYPE_CHECKING:
+    from btfref.types import Facts, PathLike
+    from btfref.validate.cache import Cache
+    from btfref.validate.matrix import Settings, Spec
+
+
 #: Fit whose file stands for the material where only its origin counts: the smallest one.
-CARRIER = {"method": "svd", "parameters": {"components": 1}}
+CARRIER, CARRIER_PARAMETERS = "svd", {"components": 1}
 
 #: Seed of the truth; not that of the synthesis or its twin, whose noise must be independent.
 TRUTH_SEED = 77
@@ -40,7 +48,7 @@ class Views:
     classes: np.ndarray
 
 
-def views_key(mesostructure, scene, lights, settings):
+def views_key(mesostructure: str, scene: str | Path, lights: str, settings: Settings) -> str:
     """Key of a `Views`."""
     named = ("truth_spp", "environment_spp")
     return key_of(
@@ -50,13 +58,13 @@ def views_key(mesostructure, scene, lights, settings):
             "lights": LIGHTS[lights],
             "size": [settings.edge(lights), settings.cells(lights)],
             **{name: getattr(settings, name) for name in named},
-            "carrier": CARRIER,
-            "code": code_of("picture", CARRIER["method"]),
+            "carrier": [CARRIER, CARRIER_PARAMETERS],
+            "code": code_of("picture", CARRIER),
         }
     )
 
 
-def make_views(cache, mesostructure, scene, lights, settings):
+def make_views(cache: Cache, mesostructure: str, scene: str | Path, lights: str, settings: Settings) -> Views:
     """Compute, or read, the `Views` of a scene.
 
     Returns
@@ -71,7 +79,7 @@ def make_views(cache, mesostructure, scene, lights, settings):
         return Views(**{name: stored[name] for name in stored.files})
 
 
-def _views(cache, mesostructure, scene, lights, settings):
+def _views(cache: Cache, mesostructure: str, scene: str | Path, lights: str, settings: Settings) -> Views:
     from btfref.registry import method
     from btfref.rendering.offline.approximate import approximate
     from btfref.rendering.offline.exact import render_exact
@@ -101,7 +109,7 @@ def _views(cache, mesostructure, scene, lights, settings):
     return Views(truth.pictures, seen[0][None], seen[1], classes)
 
 
-def shared_settings(file, lights, settings):
+def shared_settings(file: PathLike, lights: str, settings: Settings) -> Facts:
     """What all renderers of a cell are told alike."""
     edge = settings.edge(lights)
     return {
@@ -111,19 +119,19 @@ def shared_settings(file, lights, settings):
     }
 
 
-def make_carrier(cache, mesostructure, settings):
+def make_carrier(cache: Cache, mesostructure: str, settings: Settings) -> Path:
     """A small file that says what the material is of."""
     from btfref.registry import method
     from btfref.representations import save
 
-    key = fit_key(mesostructure, CARRIER["method"], settings)
+    key = fit_key(mesostructure, CARRIER, settings)
     if cache.has(key, ".carrier.exr"):
         return cache.path(key, ".carrier.exr")
     btf = load_material(make_material(cache, mesostructure, settings)[0])
-    made = method(CARRIER["method"]).fit(btf, **CARRIER["parameters"])
+    made = method(CARRIER).fit(btf, **CARRIER_PARAMETERS)
     return cache.write(key, ".carrier.exr", lambda path: save(made, path))
 
 
-def fitted(cache, spec, settings):
+def fitted(cache: Cache, spec: Spec, settings: Settings) -> Path:
     """The file of a cell's method."""
     return make_fit(cache, spec.mesostructure, spec.method, settings)

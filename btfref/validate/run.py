@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from itertools import groupby
 from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from btfref.comparison.comparison import json_safe
 from btfref.errors import BtfrefError, InputError
@@ -22,8 +25,18 @@ from btfref.validate.material import fit_key, load_material, make_fit, make_mate
 from btfref.validate.matrix import FULL, Settings
 from btfref.validate.pictures import make_carrier, make_views
 
+if TYPE_CHECKING:
+    from btfref.gates.verdicts import GateResult
+    from btfref.types import Facts, PathLike, Progress
+    from btfref.validate.matrix import Spec
+
+
 #: Memory that a process needs: a BTF of 64² texels and 81² directions twice over, and its pictures.
 MEMORY_PER_WORKER = 3 << 30
+
+
+#: A function of a process, which also tells whether it computed anything now, and its arguments.
+_Job = tuple[Callable[..., tuple[Any, bool]], tuple[Any, ...]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,27 +55,27 @@ class Validation:
     jobs : int
     """
 
-    cells: list
-    methods: list
+    cells: list[CellResult]
+    methods: list[Facts]
     settings: Settings
     seconds: float = 0.0
     computed: int = 0
     jobs: int = 0
-    facts: dict = field(default_factory=dict)
+    facts: Facts = field(default_factory=dict)
 
     @property
-    def failed_gates(self):
+    def failed_gates(self) -> list[tuple[str, GateResult]]:
         """``(where, GateResult)`` of every gate that did not pass."""
         pairs = [(cell.facts["name"], gate) for cell in self.cells for gate in cell.gates]
         pairs += [(method_name(facts), gate_from(g)) for facts in self.methods for g in facts["gates"]]
         return [(name, gate) for name, gate in pairs if not gate.passed]
 
     @property
-    def passed(self):
+    def passed(self) -> bool:
         """Whether there are cells and every gate passed."""
         return bool(self.cells) and not self.failed_gates
 
-    def to_dict(self):
+    def to_dict(self) -> Facts:
         """Strict JSON; see ``btfref/validate/schema.json``."""
         return json_safe(
             {
@@ -80,12 +93,19 @@ class Validation:
         )
 
 
-def method_name(facts):
+def method_name(facts: Facts) -> str:
     """Name of a method's own checks, for people."""
     return f"{facts['method']} · evaluators · {facts['mesostructure']}"
 
 
-def validate(specs, *, settings=FULL, cache=None, workers=None, progress=None):
+def validate(
+    specs: Sequence[Spec],
+    *,
+    settings: Settings = FULL,
+    cache: PathLike | None = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Validation:
     """Compute cells of the matrix.
 
     Parameters
@@ -119,7 +139,7 @@ def validate(specs, *, settings=FULL, cache=None, workers=None, progress=None):
     materials = sorted({spec.mesostructure for spec in specs})
     views = sorted({(spec.mesostructure, spec.scene, spec.lights) for spec in specs})
     methods = [list(group) for _, group in groupby(specs, key=lambda s: (s.mesostructure, s.method))]
-    stages = [
+    stages: list[list[_Job]] = [
         [(_material_job, (root, name, settings)) for name in materials],
         [(_views_job, (root, *view, settings)) for view in views],
         [(_method_job, (root, group, settings)) for group in methods],
@@ -143,7 +163,7 @@ def validate(specs, *, settings=FULL, cache=None, workers=None, progress=None):
     return Validation(cells, of_methods, settings, time.perf_counter() - start, computed, total, facts)
 
 
-def default_workers():
+def default_workers() -> int:
     """Processes that cores and memory allow."""
     from btfref.sampling.memory import default_budget
 
@@ -154,21 +174,21 @@ def default_workers():
 class _Here:
     """The pool of one worker: this process."""
 
-    def __enter__(self):
+    def __enter__(self) -> _Here:
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         return None
 
 
-def _pool(workers):
+def _pool(workers: int) -> _Here | ProcessPoolExecutor:
     if workers == 1:
         return _Here()
     # Spawned: neither Dr.Jit nor a GL driver survives a fork.
     return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_start_worker)
 
 
-def _start_worker():
+def _start_worker() -> None:
     """One core a process: their threads would only wait for each other."""
     os.environ["LP_NUM_THREADS"] = "1"
     from threadpoolctl import threadpool_limits
@@ -186,7 +206,7 @@ def _start_worker():
     dr.set_thread_count(1)
 
 
-def _each(pool, jobs):
+def _each(pool: _Here | ProcessPoolExecutor, jobs: Sequence[_Job]) -> Iterator[tuple[Any, bool]]:
     """Results of jobs as they come; ``(result, whether it was computed now)``."""
     if isinstance(pool, _Here):
         for job, arguments in jobs:
@@ -202,7 +222,7 @@ def _each(pool, jobs):
         ) from error
 
 
-def _material_job(root, mesostructure, settings):
+def _material_job(root: PathLike, mesostructure: str, settings: Settings) -> tuple[None, bool]:
     cache = Cache(root)
     before = len(os.listdir(root)) if os.path.isdir(root) else 0
     make_material(cache, mesostructure, settings)
@@ -210,7 +230,9 @@ def _material_job(root, mesostructure, settings):
     return None, len(os.listdir(root)) != before
 
 
-def _views_job(root, mesostructure, scene, lights, settings):
+def _views_job(
+    root: PathLike, mesostructure: str, scene: str | Path, lights: str, settings: Settings
+) -> tuple[None, bool]:
     before = len(os.listdir(root))
     try:
         make_views(Cache(root), mesostructure, scene, lights, settings)
@@ -220,7 +242,7 @@ def _views_job(root, mesostructure, scene, lights, settings):
     return None, len(os.listdir(root)) != before
 
 
-def _method_job(root, specs, settings):
+def _method_job(root: PathLike, specs: Sequence[Spec], settings: Settings) -> tuple[Facts, bool]:
     """All cells of one method and mesostructure, and the method's own checks."""
     cache, first = Cache(root), specs[0]
     facts = {"mesostructure": first.mesostructure, "method": first.method}
@@ -236,7 +258,7 @@ def _method_job(root, specs, settings):
     return {**facts, **json_safe(checks), "cells": cells}, set(os.listdir(root)) != before
 
 
-def _checks(cache, spec, file, settings):
+def _checks(cache: Cache, spec: Spec, file: PathLike, settings: Settings) -> Facts:
     """Agreement of the evaluators, sampling, and held-out directions of a method; cached."""
     from btfref.registry import method
     from btfref.representations.file.container import read_info

@@ -7,10 +7,11 @@ on its way to the comparison. What has no fault must pass all the same gates fir
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from btfref.errors import BtfrefError
 from btfref.gates.tolerances import gate_table, limits
@@ -18,6 +19,12 @@ from btfref.gates.verdicts import with_class
 from btfref.platform import shader_directory
 from btfref.validate.fault_bench import Bench
 from btfref.validate.faults import FAULTS
+
+if TYPE_CHECKING:
+    from btfref.gates.verdicts import GateResult
+    from btfref.representations.protocol import Representation
+    from btfref.types import Facts, PathLike, Progress
+    from btfref.validate.faults import Fault
 
 
 @dataclass(frozen=True)
@@ -50,12 +57,12 @@ class Caught:
         failed = ", ".join(map(with_class, self.failed)) or "none"
         return [self.name, with_class(self.meant), "caught" if self.caught else "MISSED", failed]
 
-    def to_dict(self):
+    def to_dict(self) -> Facts:
         """JSON-able form."""
         return {**vars(self), "failed": list(self.failed), "clean": list(self.clean)}
 
 
-def self_test(*, progress=None):
+def self_test(*, progress: Progress | None = None) -> list[Caught]:
     """Inject every fault.
 
     Parameters
@@ -85,7 +92,7 @@ def self_test(*, progress=None):
     return results
 
 
-def _inject(bench, fault):
+def _inject(bench: Bench, fault: Fault) -> Caught:
     clean = _failed(bench.clean(fault))
     if fault.edit:
         with edited_shader(bench.folder / fault.name.replace(" ", "_"), *fault.edit):
@@ -96,12 +103,12 @@ def _inject(bench, fault):
     return Caught(fault.name, fault.meant, caught, failed, clean)
 
 
-def _failed(gates):
+def _failed(gates: Sequence[GateResult]) -> tuple[str, ...]:
     return tuple(sorted({gate.name for gate in gates if not gate.passed}))
 
 
 @contextmanager
-def edited_shader(folder, file, right, wrong):
+def edited_shader(folder: PathLike, file: str, right: str, wrong: str) -> Iterator[None]:
     """All representations with a copy of one shader file in which a text is replaced.
 
     Parameters
@@ -128,7 +135,7 @@ def edited_shader(folder, file, right, wrong):
     target.write_text(text.replace(right, wrong), "utf-8")
     shipped = device.shader_file
 
-    def faulty(rep):
+    def faulty(rep: Representation) -> tuple[str, list[Path]]:
         shader, directories = shipped(rep)
         return shader, [Path(folder), *directories]
 
@@ -139,7 +146,7 @@ def edited_shader(folder, file, right, wrong):
         device.shader_file = shipped
 
 
-def used_gates():
+def used_gates() -> set[str]:
     """Keys of all gates that a validation, a comparison with another renderer or this self-test applies.
 
     Returns
@@ -153,6 +160,6 @@ def used_gates():
     return keys.union(own_renderer.LINEAR, own_renderer.EIGHT_BIT, own_renderer.NOISY)
 
 
-def entries(keys):
+def entries(keys: Iterable[str]) -> set[str]:
     """All limits of gates, as ``gate.entry``."""
     return {f"{key}.{entry}" for key in keys for entry in limits(gate_table(key))}

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from btfref.types import Facts
+    from btfref.validate.run import Validation
+
 
 HEADER = [
     "mesostructure",
@@ -23,7 +31,7 @@ HEADER = [
 STAGES = HEADER[4:9]
 
 
-def rows(result):
+def rows(result: Validation) -> list[list[Any]]:
     """Summary of a `Validation`.
 
     Returns
@@ -56,7 +64,7 @@ def rows(result):
     return table
 
 
-def additivity(result):
+def additivity(result: Validation) -> str:
     """How many waterfalls add up, in words: by their stages alone, and together with their covariances."""
     falls = [cell.facts["waterfall"] for cell in result.cells if cell.facts["waterfall"]]
     alone = sum(fall["additive"] for fall in falls)
@@ -64,17 +72,17 @@ def additivity(result):
     return f"stages alone add up in {alone} cells, stages and covariances in {explained} of {len(falls)} waterfalls"
 
 
-def _stage(fall, name):
+def _stage(fall: Facts, name: str) -> float | None:
     stages = [*fall["stages"], *fall["parts"]]
     found = [s["rmse"]["estimate"] for s in stages if s["name"] == name]
     return _relative(found[0], fall) if found else None
 
 
-def _relative(value, fall):
+def _relative(value: float, fall: Facts) -> float | None:
     return value / fall["mean"] if fall["mean"] else None
 
 
-def _root(values):
+def _root(values: Iterable[float | None]) -> float | None:
     """Root of the mean square of those that are there; None for none."""
     there = [v for v in values if v is not None]
     return float(np.sqrt(np.mean(np.square(there)))) if there else None

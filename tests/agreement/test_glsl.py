@@ -58,7 +58,7 @@ def test_a_lost_piece_fails_the_probe(need, rng, fits, tmp_path, monkeypatch):
     text = (shader_directory() / "lib/lookup/angles.glsl").read_text()
     coarse = text.replace("return x + x * z * p;", "return atan(x) + 3e-6 * x;")
     assert coarse != text
-    (tmp_path / "lib").mkdir()
+    (tmp_path / "lib/lookup").mkdir(parents=True)
     (tmp_path / "lib/lookup/angles.glsl").write_text(coarse)
     rep = fits("raw")
     shader, _ = device.shader_file(rep)

@@ -9,13 +9,21 @@ from __future__ import annotations
 import statistics
 import tempfile
 import time
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.bench.timing import machine
 from btfref.conventions import PixelClass
 from btfref.scene.shipped import scene_file
+
+if TYPE_CHECKING:
+    from btfref.rendering.result import RenderResult
+    from btfref.sampling import SampledBTF
+    from btfref.types import Facts, PathLike, Progress
+
 
 #: Pictures are small: the noise of their references averages out over the sphere.
 SIZE, GRID = (32, 32), 2
@@ -33,7 +41,13 @@ ROUNDS = 9
 FRAME = (800, 800)
 
 
-def run(*, quick=False, progress=None, btf=None, only=None):
+def run(
+    *,
+    quick: bool = False,
+    progress: Progress | None = None,
+    btf: SampledBTF | None = None,
+    only: Iterable[str] | None = None,
+) -> Facts:
     """Error against order, clusters, components and bits; time of the products and of frames.
 
     Parameters
@@ -60,7 +74,7 @@ def run(*, quick=False, progress=None, btf=None, only=None):
     summary, raw = {}, {}
     with tempfile.TemporaryDirectory() as folder:
 
-        def fitted(key):
+        def fitted(key: str) -> Path:
             path = Path(folder) / f"bench.{key}.exr"
             if not path.exists():
                 save(methods()[key].fit(btf), path)
@@ -75,28 +89,29 @@ def run(*, quick=False, progress=None, btf=None, only=None):
     return {"suite": "env", "parameters": parameters, "raw": raw, "summary": summary, "machine": machine()}
 
 
-def _scene(path, scene, environment):
+def _scene(path: PathLike, scene: str, environment: str) -> tuple[Path, Facts]:
     parameters = {"btf": str(path), "lights": "envmap", "environment": environment}
     return scene_file(scene), {"parameters": parameters, "size": SIZE, "grid": GRID}
 
 
-def _inside(file, settings):
+def _inside(file: PathLike, settings: Facts) -> np.ndarray:
     from btfref.scene.pixel_classes import pixel_classes
 
     return pixel_classes(file, **settings) == PixelClass.INTERIOR
 
 
-def _error(image, reference, inside):
+def _error(image: RenderResult, reference: RenderResult, inside: np.ndarray) -> dict[str, float]:
     """Noise-corrected relative RMSE with its 99 % interval."""
     from btfref.comparison import significance
 
     difference = image.image[inside].astype(float) - reference.image[inside]
+    assert reference.variance is not None
     mse = significance.mse_interval(difference, reference.variance[inside].astype(float), confidence=0.99)
     found, scale = significance.rmse_interval(mse), float(reference.image[inside].mean())
     return {"rmse": found.estimate / scale, "low": found.low / scale, "high": found.high / scale}
 
 
-def _prefiltered(fitted, quick):
+def _prefiltered(fitted: Callable[[str], Path], quick: bool) -> tuple[list[Facts], list[float]]:
     """Every method with prefiltered maps, on a sphere."""
     from btfref.registry import methods
     from btfref.rendering.gl.renderer import realtime
@@ -117,7 +132,7 @@ def _prefiltered(fitted, quick):
     return rows, raw
 
 
-def _order(fitted, quick):
+def _order(fitted: Callable[[str], Path], quick: bool) -> tuple[list[Facts], list[float]]:
     """Spherical harmonics of each order on a sphere, with and without a window, and lights for comparison."""
     from btfref.rendering.gl.renderer import realtime
     from btfref.rendering.offline.converged import converged
@@ -130,8 +145,9 @@ def _order(fitted, quick):
         reference = converged(file, inside, gate="image.environment_lights", shadows=False, **settings)
         raw.append(time.perf_counter() - start)
         lit = realtime(file, environment="lights", **settings)
-        rows.append({"environment": environment, "way": f"{lit.meta['environment_lights']} lights"})
-        rows[-1] |= _error(lit, reference, inside) | {"estimated": lit.meta["estimated_error"]}
+        way = f"{lit.meta['environment_lights']} lights"
+        found = _error(lit, reference, inside) | {"estimated": lit.meta["estimated_error"]}
+        rows.append({"environment": environment, "way": way, **found})
         for order in list(ORDERS)[:: 2 if quick else 1]:
             for window in ("none", "hanning"):
                 image = realtime(file, environment="sh", order=order, window=window, **settings)
@@ -141,7 +157,7 @@ def _order(fitted, quick):
     return rows, raw
 
 
-def _transfer(fitted, quick):
+def _transfer(fitted: Callable[[str], Path], quick: bool) -> tuple[list[Facts], list[float]]:
     """Compression of the transfer in a bowl: relative RMSE to spherical harmonics per pixel."""
     from btfref.rendering.environment_light.transfer import TransferSettings
     from btfref.rendering.gl.renderer import realtime
@@ -149,7 +165,7 @@ def _transfer(fitted, quick):
     file, settings = _scene(fitted("lpca"), "bowl", "studio")
     inside, rows, raw = _inside(file, settings), [], []
     exact = realtime(file, environment="sh", **settings).image[inside]
-    settings_of = [{"clusters": k} for k in CLUSTERS] + [{"components": c} for c in COMPONENTS]
+    settings_of: list[Facts] = [{"clusters": k} for k in CLUSTERS] + [{"components": c} for c in COMPONENTS]
     settings_of += [{"map_size": n} for n in MAP_SIZES] + [{"bits": 8}, {"bits": 8, "components": 4}]
     for given in settings_of[:: 2 if quick else 1]:
         start = time.perf_counter()
@@ -161,7 +177,7 @@ def _transfer(fitted, quick):
     return rows, raw
 
 
-def _time(fitted, quick):
+def _time(fitted: Callable[[str], Path], quick: bool) -> tuple[list[Facts], dict[str, list[float]]]:
     """Milliseconds of the products at the paper's setting, and of frames."""
     from btfref.rendering.environment_light import transfer_light
     from btfref.rendering.environment_light.lighting import lighting_of
@@ -169,7 +185,7 @@ def _time(fitted, quick):
     from btfref.rendering.gl.renderer import Renderer
     from btfref.scene.description import read_scene
 
-    rows, raw = [], {}
+    raw: dict[str, list[float]] = {}
     file, settings = _scene(fitted("lpca"), "bowl", "studio")
     size = (200, 200) if quick else FRAME
     scene = read_scene(file, settings["parameters"], size=size)
@@ -198,9 +214,9 @@ def _time(fitted, quick):
     return rows, raw
 
 
-def table(result):
+def table(result: Facts) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Rows for people: table, setting, error."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for entry in result["summary"].get("prefiltered", ()):
         rows.append((f"prefiltered, {entry['method']}", entry["environment"], _percent(entry)))
     for entry in result["summary"].get("order", ()):
@@ -216,11 +232,11 @@ def table(result):
     return ("what", "where", "relative RMSE (99 %), or time"), rows
 
 
-def _percent(entry):
+def _percent(entry: Facts) -> str:
     return f"{100 * entry['rmse']:.2f} % ({100 * entry['low']:.2f} … {100 * entry['high']:.2f})"
 
 
-def plot(result, path):
+def plot(result: Facts, path: PathLike) -> None:
     """Error against the order of spherical harmonics: see :func:`btfref.report.order_plot.plot_orders`."""
     from btfref.report.order_plot import plot_orders
 

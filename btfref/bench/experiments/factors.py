@@ -7,7 +7,9 @@ with chained matrix factorization, 35 minutes of clustering for 4096 texels, and
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable, Mapping
 from importlib import import_module
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,11 +17,18 @@ from btfref.bench.data import MESOSTRUCTURES, material_name, materials
 from btfref.bench.timing import machine
 from btfref.errors import InputError
 
+if TYPE_CHECKING:
+    from btfref.representations.factored.definition import Representation
+    from btfref.representations.factored.fit import Factors
+    from btfref.sampling import SampledBTF
+    from btfref.types import Facts, Progress
+
+
 #: How the paper stores maps: no scales fitted again, linear codes.
-PUBLISHED = {"rescale": False, "code": "linear"}
+PUBLISHED: Facts = {"rescale": False, "code": "linear"}
 
 #: Name → method, parameters of the factorization, parameters of storing.
-VARIANTS = {
+VARIANTS: dict[str, tuple[str, Facts, Facts]] = {
     "cmf, as published": ("cmf", {"sweeps": 0}, PUBLISHED),
     "hf, as published": ("hf", {"floor": 1e-3, "bounded": False}, PUBLISHED),
     "cmf": ("cmf", {}, {}),
@@ -39,7 +48,13 @@ RELMSE_SHARE = 0.1
 N_PICTURES = 64
 
 
-def run(*, quick=False, progress=None, btf=None, only=None):
+def run(
+    *,
+    quick: bool = False,
+    progress: Progress | None = None,
+    btf: SampledBTF | None = None,
+    only: Iterable[str] | None = None,
+) -> Facts:
     """Times and errors of the variants.
 
     Parameters
@@ -66,13 +81,17 @@ def run(*, quick=False, progress=None, btf=None, only=None):
 
     variants = {name: v for name, v in VARIANTS.items() if not only or v[0] in only}
     if not variants:
-        raise InputError("nothing to measure", field="--only", got=", ".join(only), expected="cmf or hf")
+        raise InputError(
+            "nothing to measure", field="--only", got=", ".join(only or ()), expected="cmf or hf"
+        )
     report = progress or (lambda *_: None)
     timed = btf or synthesize(
         "checker", texels=64, views="8x8", lights="8x8", spp=DRAFT_SPP, progress=progress
     )
     rounds = 1 if quick else 3
-    raw = {f"{name}, {part}": [] for name in variants for part in ("factorization", "clustering")}
+    raw: dict[str, list[float]] = {
+        f"{name}, {part}": [] for name in variants for part in ("factorization", "clustering")
+    }
     kept = {}
     for turn in range(rounds):
         for i, (name, (key, parameters, _)) in enumerate(variants.items()):
@@ -109,12 +128,17 @@ def run(*, quick=False, progress=None, btf=None, only=None):
     }
 
 
-def factorize(key, btf, parameters):
+def factorize(key: str, btf: SampledBTF, parameters: Facts) -> Factors:
     """Factors by one method."""
     return import_module(f"btfref.representations.{key}").factorize(btf, **parameters)
 
 
-def judged(btf, variants, factors, report):
+def judged(
+    btf: SampledBTF,
+    variants: Mapping[str, tuple[str, Facts, Facts]],
+    factors: Mapping[str, Factors],
+    report: Progress,
+) -> tuple[Facts, Facts]:
     """Errors of every variant and storage on one BTF, and the ranges of the factors' values.
 
     Parameters
@@ -132,7 +156,8 @@ def judged(btf, variants, factors, report):
     """
     from btfref.representations.factored.storage import Storing, cluster, store
 
-    errors, ranges = {}, {}
+    errors: Facts = {}
+    ranges: Facts = {}
     for i, (name, (key, parameters, how)) in enumerate(variants.items()):
         report(i + 1, len(variants), f"errors: {name}")
         fitted = factors.get(name) or factorize(key, btf, parameters)
@@ -147,7 +172,7 @@ def judged(btf, variants, factors, report):
     return errors, ranges
 
 
-def spread(maps):
+def spread(maps: np.ndarray) -> float:
     """Median over maps of peak over median, the largest of the channels; shape (map, n, n, 3)."""
     texels = maps.reshape(len(maps), -1, 3)
     middle = np.median(texels, 1)
@@ -156,7 +181,7 @@ def spread(maps):
     return float(np.nanmedian(np.nanmax(ratio[lit.any(1)], 1))) if lit.any() else 0.0
 
 
-def table_errors(fitted, btf):
+def table_errors(fitted: Representation, btf: SampledBTF) -> dict[str, float]:
     """Errors of a factored representation at all measured pairs of directions.
 
     Parameters
@@ -184,7 +209,7 @@ def table_errors(fitted, btf):
     epsilon = (RELMSE_SHARE * float(values.mean(dtype=float))) ** 2
     squared = relative = energy = 0.0
     pick = np.random.default_rng(0).integers(0, values.shape[:2], (N_PICTURES, 2)).T
-    pictures = [], []
+    pictures: tuple[list[np.ndarray], list[np.ndarray]] = [], []
     for texels in texel_parts(n_texels):
         reference = values[:, :, texels].astype(np.float32)
         model = fitted.tables(texels, operators)
@@ -203,7 +228,7 @@ def table_errors(fitted, btf):
     }
 
 
-def table(result):
+def table(result: Facts) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Rows for people: material, variant, speed, range of Q, and errors of each storage."""
     header = (
         "material",
@@ -216,7 +241,7 @@ def table(result):
         "relMSE",
         "ΔE00",
     )
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for material, variants in result["errors"].items():
         for name, storages in variants.items():
             about = (

@@ -7,10 +7,21 @@ to 2 times that of local PCA at a tenth of the bytes.
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.bench.timing import machine
+
+if TYPE_CHECKING:
+    from btfref.numerics.heightfield import HeightField
+    from btfref.report import Cell
+    from btfref.representations.gbrdf.definition import Representation as Microfacets
+    from btfref.representations.protocol import Representation
+    from btfref.sampling import SampledBTF
+    from btfref.types import Facts, PathLike, Progress
+
 
 #: Pairs of directions whose pictures are compared by colour difference.
 N_PICTURES = 64
@@ -22,7 +33,14 @@ _ENLARGED = 4
 SIZES = (32, 64)
 
 
-def run(*, quick=False, progress=None, btf=None, only=None, report=None):
+def run(
+    *,
+    quick: bool = False,
+    progress: Progress | None = None,
+    btf: SampledBTF | None = None,
+    only: Iterable[str] | None = None,
+    report: PathLike | None = None,
+) -> Facts:
     """Times and errors.
 
     Parameters
@@ -54,7 +72,7 @@ def run(*, quick=False, progress=None, btf=None, only=None, report=None):
         cases = [
             synthesize("checker", texels=n, spp=16, estimator="surface", progress=progress) for n in sizes
         ]
-    cells = []
+    cells: list[Cell] = []
     result = {"suite": "gbrdf", "cases": [case(b, progress, cells) for b in cases], "machine": machine()}
     if report is not None:
         from btfref.report import write_report
@@ -63,7 +81,7 @@ def run(*, quick=False, progress=None, btf=None, only=None, report=None):
     return result
 
 
-def case(btf, progress=None, cells=None):
+def case(btf: SampledBTF, progress: Progress | None = None, cells: list[Cell] | None = None) -> Facts:
     """Figures of one BTF; see :func:`run`. A list ``cells`` takes the parts of a report."""
     from btfref.registry import method
     from btfref.representations.file.container import payload_bytes
@@ -71,7 +89,7 @@ def case(btf, progress=None, cells=None):
     from btfref.representations.gbrdf.geometry import from_mesostructure
 
     start = time.perf_counter()
-    stages = {}
+    stages: Facts = {}
     made = pipeline.fit(btf, progress=progress, intermediates=stages)
     seconds = time.perf_counter() - start
     pairs = len(btf.views) * len(btf.lights) * int(np.prod(btf.texels))
@@ -104,7 +122,7 @@ def case(btf, progress=None, cells=None):
     return result
 
 
-def material_figures(made, truth):
+def material_figures(made: Microfacets, truth: Microfacets) -> Facts:
     """``areas`` and ``colours`` of materials, found and true; see :func:`run`."""
     part = truth.maps["material"][..., 0]
     both = {"ours": made, "truth": truth}
@@ -119,7 +137,7 @@ def material_figures(made, truth):
     }
 
 
-def picture_error(representation, btf):
+def picture_error(representation: Representation, btf: SampledBTF) -> float:
     """RMS ΔE00 over pictures of one view and one light each, under one exposure."""
     from btfref.comparison.colour import delta_e00
     from btfref.images.display import fit_display
@@ -138,7 +156,7 @@ def picture_error(representation, btf):
     return float(np.sqrt((error**2).mean()))
 
 
-def height_fields(btf, stages):
+def height_fields(btf: SampledBTF, stages: Facts) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Heights in tiles and slopes by name: ours and the paper's two baselines."""
     from btfref.numerics.heightfield import HeightField
     from btfref.representations.gbrdf.decomposition.heights import (
@@ -162,7 +180,9 @@ def height_fields(btf, stages):
     }
 
 
-def height_errors(fields, truth):
+def height_errors(
+    fields: dict[str, tuple[np.ndarray, np.ndarray]], truth: HeightField
+) -> dict[str, dict[str, float]]:
     """RMS error of heights in tiles and mean angle between normals in degrees, of :func:`height_fields`."""
     return {
         key: {
@@ -173,7 +193,9 @@ def height_errors(fields, truth):
     }
 
 
-def map_cells(name, fields, made, truth):
+def map_cells(
+    name: str, fields: dict[str, tuple[np.ndarray, np.ndarray]], made: Microfacets, truth: Microfacets
+) -> list[Cell]:
     """Parts of a report: heights, normals, materials and colours beside the truth."""
     from btfref.comparison import compare
     from btfref.report import Cell
@@ -206,20 +228,20 @@ def map_cells(name, fields, made, truth):
     return cells
 
 
-def mean_angle(a, b):
+def mean_angle(a: np.ndarray, b: np.ndarray) -> float:
     """Mean angle in degrees between the normals of two maps of slopes, shape (rows, columns, 2)."""
     product = (unit_normals(a) * unit_normals(b)).sum(-1)
     return float(np.degrees(np.arccos(np.clip(product, -1, 1))).mean())
 
 
-def unit_normals(slopes):
+def unit_normals(slopes: np.ndarray) -> np.ndarray:
     """Normals of slopes, shape (..., 2) -> (..., 3)."""
     slopes = np.asarray(slopes, float)
     normal = np.concatenate([-slopes, np.ones((*slopes.shape[:-1], 1))], -1)
     return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
 
 
-def table(result):
+def table(result: Facts) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Rows for people."""
     header = ("BTF", "s", "µs/sample", "materials", "kB", "ΔE00", "lpca", "oracle", "heights RMS, normals °")
     rows = []

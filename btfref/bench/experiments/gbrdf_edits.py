@@ -4,8 +4,11 @@ Run in a checkout: ``python btfref/bench/experiments/gbrdf_edits.py FOLDER``. Th
 stay in FOLDER.
 """
 
+from __future__ import annotations
+
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
@@ -20,10 +23,14 @@ from btfref.representations.gbrdf.geometry import from_mesostructure
 from btfref.representations.gbrdf.maps import export_maps, hue_of_turns, import_maps, turns_of_hue
 from btfref.scene.shipped import scene_file
 
+if TYPE_CHECKING:
+    from btfref.representations.gbrdf.definition import Representation
+
+
 SIZE = (192, 192)
 
 
-def logo(shape):
+def logo(shape: tuple[int, int]) -> np.ndarray:
     """A ring with a bar: the shape that is pasted into maps."""
     v, u = ((np.arange(n) + 0.5) / n - 0.5 for n in shape)
     u, v = np.meshgrid(u, v)
@@ -31,7 +38,7 @@ def logo(shape):
     return (np.abs(radius - 0.3) < 0.07) | ((np.abs(u) < 0.06) & (radius < 0.3))
 
 
-def changed(rep, **changes):
+def changed(rep: Representation, **changes: Any) -> Representation:
     """A g-BRDF with some maps replaced."""
     maps = {
         "height": rep.maps["height"][..., 0],
@@ -50,7 +57,7 @@ def changed(rep, **changes):
     )
 
 
-def meso_structure(folder, cloth):
+def meso_structure(folder: Path, cloth: Representation) -> Representation:
     """1. Fibres turned by a quarter under the logo, in rotation.png as any picture editor would."""
     export_maps(cloth, folder / "1-maps")
     path = folder / "1-maps" / "rotation.png"
@@ -61,7 +68,7 @@ def meso_structure(folder, cloth):
     return import_maps(folder / "1-maps")
 
 
-def colour(cloth):
+def colour(cloth: Representation) -> Representation:
     """2. Colour channels exchanged in diffuse map and distributions; light pink lint at grazing half vectors."""
     swap = [2, 1, 0]
     z = texel_directions(cloth.maps["ndf"].shape[1])[..., 2]
@@ -69,7 +76,7 @@ def colour(cloth):
     return changed(cloth, diffuse=cloth.maps["diffuse"][..., swap], ndf=cloth.maps["ndf"][..., swap] + lint)
 
 
-def synthetic_material(checker):
+def synthetic_material(checker: Representation) -> Representation:
     """3. The logo engraved and painted with a new, glossy material."""
     mark = logo(checker.maps["height"].shape[:2])
     height = checker.maps["height"][..., 0] - 0.25 * mark
@@ -89,7 +96,7 @@ def synthetic_material(checker):
     )
 
 
-def photograph(folder):
+def photograph(folder: Path) -> Representation:
     """4. A g-BRDF from one picture: diffuse map, height from its grey values, a minor highlight."""
     v, u = np.meshgrid(*[(np.arange(128) + 0.5) / 128] * 2, indexing="ij")
     # A wall of bricks, drawn: it tiles, and everybody has it.
@@ -103,7 +110,7 @@ def photograph(folder):
     return from_photograph(folder / "4-photograph.png", depth=0.04)
 
 
-def picture(rep, path):
+def picture(rep: Representation, path: Path) -> np.ndarray:
     """The shipped cloth scene, in real time."""
     save(rep, path)
     return realtime(
@@ -111,7 +118,7 @@ def picture(rep, path):
     ).image
 
 
-def main(folder):
+def main(folder: Path) -> None:
     """Make all maps and pictures."""
     folder.mkdir(parents=True, exist_ok=True)
     cloth, checker = from_mesostructure("tissue", texels=96), from_mesostructure("checker", texels=64)

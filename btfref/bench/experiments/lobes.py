@@ -8,11 +8,18 @@ from __future__ import annotations
 
 import statistics
 import time
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.bench.timing import interleaved, machine
 from btfref.numerics.solvers.threads import one_blas_thread
+
+if TYPE_CHECKING:
+    from btfref.sampling import SampledBTF
+    from btfref.types import Facts, Progress
+
 
 LOBES = 2
 
@@ -26,7 +33,13 @@ PEERS = {
 }
 
 
-def run(*, quick=False, progress=None, btf=None, only=None):
+def run(
+    *,
+    quick: bool = False,
+    progress: Progress | None = None,
+    btf: SampledBTF | None = None,
+    only: Iterable[str] | None = None,
+) -> Facts:
     """Seconds per fit and mean error of both.
 
     Parameters
@@ -48,24 +61,25 @@ def run(*, quick=False, progress=None, btf=None, only=None):
     """
     from btfref.bench.data import checker
     from btfref.representations.analytic import rf_lobes
+    from btfref.representations.analytic.lobe_start import lobe_starts
 
     btf = btf or checker(spp=8, progress=progress)
     lights = btf.lights.vectors
     data = residual_fields(btf)
     start = time.perf_counter()
     whole = rf_lobes.fit(btf).meta["fit"]
-    raw = {"whole fit": time.perf_counter() - start}
+    raw: Facts = {"whole fit": time.perf_counter() - start}
     chosen = np.sort(np.random.default_rng(0).choice(len(data), 8 if quick else 64, replace=False))
     some = data[chosen].astype(float)
-    starts = rf_lobes.lobe_starts(data[chosen], lights, LOBES).astype(float)
+    starts = lobe_starts(data[chosen], lights, LOBES).astype(float)
     lower, upper = (bound.astype(float) for bound in rf_lobes.lobe_bounds(data[chosen], btf.lights, LOBES))
     found = {}
 
-    def batched():
+    def batched() -> None:
         found["result"] = rf_lobes.fit_lobes(data, btf.lights, LOBES)
 
-    def peer(name, jacobian):
-        def task():
+    def peer(name: str, jacobian: bool) -> Callable[[], None]:
+        def task() -> None:
             # Threads would slow such small algebra down, which is no fair peer.
             with one_blas_thread():
                 found[name] = np.stack(
@@ -108,7 +122,7 @@ def run(*, quick=False, progress=None, btf=None, only=None):
     }
 
 
-def residual_fields(btf):
+def residual_fields(btf: SampledBTF) -> np.ndarray:
     """Luminance without its diffuse term, shape (n_views · n_texels, n_lights)."""
     from btfref.representations.analytic import rf_lobes
     from btfref.representations.analytic.light_functions import luminance_blocks
@@ -121,7 +135,7 @@ def residual_fields(btf):
     return np.concatenate(data)
 
 
-def lobes_and_jacobian(p, lights):
+def lobes_and_jacobian(p: np.ndarray, lights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Values at the lights and derivatives by the parameters (s, t, ln n, peak) of each lobe."""
     value, columns = np.zeros(len(lights)), []
     for s, t, log_n, peak in p.reshape(-1, 4):
@@ -138,7 +152,14 @@ def lobes_and_jacobian(p, lights):
     return value, np.stack(columns, 1)
 
 
-def scipy_fit(data, lights, start, lower, upper, jacobian):
+def scipy_fit(
+    data: np.ndarray,
+    lights: np.ndarray,
+    start: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    jacobian: bool,
+) -> np.ndarray:
     """Parameters that ``scipy.optimize.least_squares`` finds with its default settings."""
     from scipy.optimize import least_squares
 
@@ -152,10 +173,10 @@ def scipy_fit(data, lights, start, lower, upper, jacobian):
     ).x
 
 
-def table(result):
+def table(result: Facts) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Rows for people: solver, time of a fit, ratio, errors."""
     header = ("solver", "time of a fit", "ratio", "mean rms × π", "mean |residual| × π")
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (
             name,
             f"{1e6 * s['seconds_per_fit']:.1f} µs",

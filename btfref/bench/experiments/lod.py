@@ -9,11 +9,21 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.bench.timing import interleaved, machine, summary
+
+if TYPE_CHECKING:
+    from btfref.gates import GateResult
+    from btfref.report import Cell
+    from btfref.sampling import SampledBTF
+    from btfref.types import Facts, JitArray, PathLike, Progress
+
 
 #: Scene: the parameter that moves, and its step between frames.
 MOVES = {"horizon": ("advance", 0.04), "turning": ("turn", 0.5)}
@@ -32,7 +42,14 @@ SIZE = (256, 256)
 LARGE = (1024, 1024)
 
 
-def run(*, quick=False, progress=None, btf=None, only=None, report=None):
+def run(
+    *,
+    quick: bool = False,
+    progress: Progress | None = None,
+    btf: SampledBTF | None = None,
+    only: Iterable[str] | None = None,
+    report: PathLike | None = None,
+) -> Facts:
     """Errors, flicker, fetches and times.
 
     Parameters
@@ -60,7 +77,9 @@ def run(*, quick=False, progress=None, btf=None, only=None, report=None):
     btf = btf or checker(spp=16, progress=progress)
     tell = progress or (lambda *_: None)
     frames, grid = (2, 12) if quick else (FRAMES, TRUTH)
-    found, cells, raw = {}, [], {}
+    found: Facts = {}
+    raw: Facts = {}
+    cells = []
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder) / "bench.laplacian.exr")
         save(method("laplacian").fit(btf, progress=progress), path)
@@ -84,7 +103,9 @@ def run(*, quick=False, progress=None, btf=None, only=None, report=None):
     return result
 
 
-def _moving(scene, path, frames, grid, tell):
+def _moving(
+    scene: str, path: str, frames: int, grid: int, tell: Progress
+) -> tuple[Facts, dict[str, np.ndarray]]:
     """Error and flicker of a scene, and the pictures of its first frame."""
     from btfref.rendering.gl.renderer import realtime
     from btfref.rendering.offline.reference import render
@@ -92,24 +113,26 @@ def _moving(scene, path, frames, grid, tell):
 
     file, (moved, step) = scene_file(scene), MOVES[scene]
     kinds = ("none", "auto")
-    pictures = {(kind, r): [] for kind in kinds for r in ("GLSL", "Mitsuba")}
-    truth = []
+    pictures: dict[tuple[str, str], list[np.ndarray]] = {
+        (kind, r): [] for kind in kinds for r in ("GLSL", "Mitsuba")
+    }
+    truths = []
     for frame in range(frames):
         tell(frame, frames, scene)
         parameters = {"btf": path, moved: str(frame * step)}
-        truth.append(render(file, parameters=parameters | {"lod": "none"}, grid=grid, shadows=False).image)
+        truths.append(render(file, parameters=parameters | {"lod": "none"}, grid=grid, shadows=False).image)
         for kind in kinds:
             own = parameters | {"lod": kind}
             pictures[kind, "GLSL"].append(realtime(file, parameters=own, grid=1).image)
             pictures[kind, "Mitsuba"].append(render(file, parameters=own, grid=1, shadows=False).image)
-    truth = np.stack(truth).astype(float)
+    truth = np.stack(truths).astype(float)
     seen = (truth != 0).any(-1)
     mean = truth[seen].mean()
     # A silhouette that moves changes a pixel wholly, with and without levels: only what is seen in both frames counts.
     both = seen[1:] & seen[:-1]
-    result = {"error": {}, "flicker": {}}
-    for (kind, renderer), images in pictures.items():
-        images = np.stack(images).astype(float)
+    result: Facts = {"error": {}, "flicker": {}}
+    for (kind, renderer), frames_of in pictures.items():
+        images = np.stack(frames_of).astype(float)
         result["error"].setdefault(renderer, {})[kind] = _rms((images - truth)[seen]) / mean
         change = np.diff(images, axis=0) - np.diff(truth, axis=0)
         result["flicker"].setdefault(renderer, {})[kind] = _rms(change[both]) / mean
@@ -120,18 +143,18 @@ def _moving(scene, path, frames, grid, tell):
     return result, shown | {"1 sample, without": pictures["none", "GLSL"][0]}
 
 
-def _rms(values):
+def _rms(values: np.ndarray) -> float:
     return float(np.sqrt((values**2).mean()))
 
 
-def _cell(scene, pictures, found):
+def _cell(scene: str, pictures: dict[str, np.ndarray], found: Facts) -> Cell:
     """The scene's part of the report."""
     from btfref.comparison import compare
     from btfref.gates import Measured, judge
     from btfref.report import Cell
 
     comparison = compare(pictures["1 sample, with levels"], pictures["reference"], flip=False)
-    gates = ()
+    gates: list[GateResult] = []
     if scene == "horizon":
         gates = judge("lod.antialiasing", {"error_ratio": Measured(found["error"]["GLSL"]["ratio"])})
     notes = "; ".join(
@@ -142,7 +165,7 @@ def _cell(scene, pictures, found):
     return Cell(f"{scene}, one sample a pixel", pictures, comparison, notes, tuple(gates))
 
 
-def _cost(path, rounds, tell):
+def _cost(path: str, rounds: int, tell: Progress) -> tuple[Facts, dict[str, dict[str, list[float]]]]:
     """Fetches and times of a plane that fills the picture, near and far."""
     import drjit as dr
 
@@ -177,10 +200,12 @@ def _cost(path, rounds, tell):
     return {"fetches": fetches | {"ratio": fetches["far"] / fetches["near"]}, "times": times}, raw
 
 
-def _reference_task(camera, reference, dr, scene):
+def _reference_task(
+    camera: ModuleType, reference: ModuleType, dr: ModuleType, scene: JitArray
+) -> Callable[[], None]:
     """Noise-free shading, one sample a pixel."""
 
-    def task():
+    def task() -> None:
         ray, _ = camera.film_rays(scene.sensors()[0], (0.5, 0.5))
         dr.eval(reference.direct(scene, ray, False))
         dr.sync_thread()
@@ -188,10 +213,10 @@ def _reference_task(camera, reference, dr, scene):
     return task
 
 
-def table(result):
+def table(result: Facts) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Rows for people."""
     header = ("scene", "figure", "renderer", "without / near", "with / far", "ratio")
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for scene, found in result["summary"].items():
         if scene == "cost":
             f = found["fetches"]

@@ -8,11 +8,20 @@ render, and by samples of the BSDF alone, which shows the proposal itself.
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.bench.timing import interleaved, machine, summary
+
+if TYPE_CHECKING:
+    from btfref.registry import Method
+    from btfref.sampling import SampledBTF
+    from btfref.types import Facts, PathLike, Progress
+
 
 #: What is compared; ratios are to the first, the guide that all methods share.
 CHOICES = ("data", "lobes", "both", "cosine")
@@ -27,7 +36,13 @@ SAMPLES, SIZE = 64, 128
 PICTURES = 4
 
 
-def run(*, quick=False, progress=None, btf=None, only=None):
+def run(
+    *,
+    quick: bool = False,
+    progress: Progress | None = None,
+    btf: SampledBTF | None = None,
+    only: Iterable[str] | None = None,
+) -> Facts:
     """Variance and time of each choice, in each light, with and without emitter sampling.
 
     Parameters
@@ -80,7 +95,7 @@ def run(*, quick=False, progress=None, btf=None, only=None):
     }
 
 
-def _has_lobes(row):
+def _has_lobes(row: Method) -> bool:
     from importlib import import_module
 
     from mitsuba_plugins.protocol import Proposes
@@ -88,7 +103,7 @@ def _has_lobes(row):
     return isinstance(import_module(row.plugin).Evaluator, Proposes)
 
 
-def _efficiency(pictures, times):
+def _efficiency(pictures: Mapping[str, Sequence[np.ndarray]], times: Mapping[str, Facts]) -> Facts:
     """Variance of a sample, and variance times time relative to the first choice."""
     result = {}
     mean = np.mean([image.mean() for image in pictures[CHOICES[0]]])
@@ -101,7 +116,7 @@ def _efficiency(pictures, times):
     return result
 
 
-def _scenes(mi):
+def _scenes(mi: ModuleType) -> dict[str, Facts]:
     """Scenes without material, by light and estimator."""
     from btfref.scene.environment import sunsky
     from btfref.scene.shipped import scene_file
@@ -143,7 +158,7 @@ def _scenes(mi):
     }
 
 
-def _task(mi, scene, path, choice):
+def _task(mi: ModuleType, scene: Facts, path: PathLike, choice: str) -> Callable[[], np.ndarray]:
     import drjit as dr
 
     bsdf = {"type": "btf", "filename": str(path), "sampling": choice}
@@ -151,14 +166,14 @@ def _task(mi, scene, path, choice):
     loaded = mi.load_dict(scene | {"shape": scene["shape"] | {"bsdf": bsdf}})
     seeds = iter(range(1 << 30))
 
-    def picture():
+    def picture() -> np.ndarray:
         # An opaque seed: a literal one would compile the kernel anew.
         return np.array(mi.render(loaded, spp=SAMPLES, seed=dr.opaque(mi.UInt32, next(seeds))))
 
     return picture
 
 
-def table(result):
+def table(result: Facts) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Rows for people: cell, then variance, time and their product relative to the guide."""
     header = ("method, light, estimator", "", *CHOICES)
     rows = []

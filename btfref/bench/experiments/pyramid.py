@@ -8,11 +8,19 @@ absolute differences over all pairs of directions: both are given, average, leas
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.bench.data import MESOSTRUCTURES, materials
 from btfref.bench.timing import machine
+
+if TYPE_CHECKING:
+    from btfref.representations.laplacian.definition import Representation
+    from btfref.sampling import SampledBTF
+    from btfref.types import Facts, Progress
+
 
 TEXELS, SPP = 64, 16
 
@@ -20,7 +28,13 @@ TEXELS, SPP = 64, 16
 COMPONENTS = (1, 2, 3, 4, 6, 8, 10, 12, 16)
 
 
-def run(*, quick=False, progress=None, btf=None, only=None):
+def run(
+    *,
+    quick: bool = False,
+    progress: Progress | None = None,
+    btf: SampledBTF | None = None,
+    only: Iterable[str] | None = None,
+) -> Facts:
     """Errors by material, setting, channel and number of components.
 
     Parameters
@@ -43,7 +57,8 @@ def run(*, quick=False, progress=None, btf=None, only=None):
     from btfref.representations.laplacian import definition as laplacian
 
     names = only or (MESOSTRUCTURES[:1] if quick else MESOSTRUCTURES)
-    summary, raw = {}, {}
+    summary: Facts = {}
+    raw: Facts = {}
     settings = {"texels": TEXELS, "spp": SPP, "estimator": "surface"}
     for name, data in materials(btf, names, progress=progress, **settings):
         channels = _channels(data)
@@ -70,7 +85,7 @@ def run(*, quick=False, progress=None, btf=None, only=None):
     }
 
 
-def _channels(btf):
+def _channels(btf: SampledBTF) -> list[np.ndarray]:
     """π B in Y, Cb, Cr, each (texels, pairs) float32."""
     from btfref.numerics.solvers.lowrank import texel_matrix
     from btfref.numerics.ycbcr import FROM_RGB
@@ -79,7 +94,7 @@ def _channels(btf):
     return [matrix @ row.astype(np.float32) for row in FROM_RGB]
 
 
-def _errors(found, expected):
+def _errors(found: np.ndarray, expected: np.ndarray) -> dict[str, dict[str, float]]:
     """Of π B, over the pairs of each texel: average, minimum and maximum over texels."""
     difference = np.pi * (found - expected)
     by_texel = {"mse": (difference**2).mean(1, dtype=float), "mae": np.abs(difference).mean(1, dtype=float)}
@@ -89,7 +104,7 @@ def _errors(found, expected):
     }
 
 
-def _truncated(representation, n):
+def _truncated(representation: Representation, n: int) -> Representation:
     """The same with the first n components of Y only."""
     levels, maps = [], dict(representation.maps)
     for k, level in enumerate(representation.meta["levels"]):
@@ -101,14 +116,14 @@ def _truncated(representation, n):
     return type(representation)(maps, representation.meta | {"levels": levels})
 
 
-def _map_bytes(representation):
+def _map_bytes(representation: Representation) -> int:
     from btfref.representations.file.container import payload_bytes
 
     maps = {name: (array.shape, array.dtype.name) for name, array in representation.maps.items()}
     return payload_bytes(maps, representation.meta)
 
 
-def table(result):
+def table(result: Facts) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Rows for people: the paper's table for both settings, then its figure."""
     header = ("material", "setting", "", "average", "minimum", "maximum", "mean |difference|")
     rows = []

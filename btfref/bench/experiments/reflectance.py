@@ -12,10 +12,19 @@ polynomials; peaks and exponents of lobes need the range of a half.
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from btfref.bench.data import MESOSTRUCTURES, materials
 from btfref.bench.timing import machine
 from btfref.errors import InputError
+
+if TYPE_CHECKING:
+    from btfref.sampling import SampledBTF
+    from btfref.types import Facts, Progress
+
 
 #: The paper's columns.
 METHODS = {"LAF": "lafortune", "SLAF": "lafortune_lut", "RFP": "rf_poly", "RFNL": "rf_lobes"}
@@ -24,7 +33,13 @@ METHODS = {"LAF": "lafortune", "SLAF": "lafortune_lut", "RFP": "rf_poly", "RFNL"
 TEXELS, SPP = 32, 16
 
 
-def run(*, quick=False, progress=None, btf=None, only=None):
+def run(
+    *,
+    quick: bool = False,
+    progress: Progress | None = None,
+    btf: SampledBTF | None = None,
+    only: Iterable[str] | None = None,
+) -> Facts:
     """ε and seconds of the four methods.
 
     Parameters
@@ -45,7 +60,9 @@ def run(*, quick=False, progress=None, btf=None, only=None):
     """
     columns = {column: key for column, key in METHODS.items() if only is None or column in only}
     if not columns:
-        raise InputError("no such column", field="only", got=", ".join(only), expected=", ".join(METHODS))
+        raise InputError(
+            "no such column", field="only", got=", ".join(only or ()), expected=", ".join(METHODS)
+        )
     names = MESOSTRUCTURES[:1] if quick else MESOSTRUCTURES
     summary, raw = {}, {}
     for name, data in materials(btf, names, texels=TEXELS, spp=SPP, progress=progress):
@@ -61,7 +78,7 @@ def run(*, quick=False, progress=None, btf=None, only=None):
     }
 
 
-def fitted(btf, key):
+def fitted(btf: SampledBTF, key: str) -> Facts:
     """ε of one method with its maps in floats, in halves and in 8 bits."""
     from btfref.registry import method
     from btfref.representations.analytic.light_functions import fit_report
@@ -87,7 +104,7 @@ def fitted(btf, key):
     return result
 
 
-def narrowed(maps, storage):
+def narrowed(maps: Mapping[str, np.ndarray], storage: str) -> dict[str, np.ndarray]:
     """The maps as halves, or as 8-bit integers between each channel's extremes, widened again."""
     import numpy as np
 
@@ -105,7 +122,7 @@ def narrowed(maps, storage):
     return result
 
 
-def table(result):
+def table(result: Facts) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Rows for people: the paper's table, seconds, and ε and bytes by type of the maps."""
     header = ("material", "", *next(iter(result["summary"].values())))
     rows = []
