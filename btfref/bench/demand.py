@@ -95,6 +95,7 @@ def run(
 def synthesis(folder: Path, quick: bool, progress: Progress) -> Facts:
     """Parts that scenes need against the whole: times, their law, bytes, pictures."""
     from btfref.numerics.sphere.directions import directions
+    from btfref.sampling.settings import SynthesisSettings
     from btfref.sampling.store.selection import Selection
     from btfref.sampling.synthesis import synthesize_store
     from btfref.scene.demand import demand
@@ -126,7 +127,7 @@ def synthesis(folder: Path, quick: bool, progress: Progress) -> Facts:
         "its views, one light": Selection(views, lights[:1]),
         "single pair": Selection(views[:1], lights[:1]),
     }
-    settings = {"texels": texels, "spp": spp, "views": directions_name, "lights": directions_name}
+    settings = SynthesisSettings(texels=texels, spp=spp, views=directions_name, lights=directions_name)
     seconds: dict[str, list[float]] = {name: [] for name in parts}
     pairs = {}
     # Parts warm all kernels up: the whole once more would take a minute.
@@ -137,10 +138,10 @@ def synthesis(folder: Path, quick: bool, progress: Progress) -> Facts:
         path = folder / f"{name}.btf.zarr"
         shutil.rmtree(path, ignore_errors=True)
         start = time.perf_counter()
-        store = synthesize_store(path, "checker", only=parts[name], **settings)
+        store = synthesize_store(path, "checker", settings, only=parts[name])
         if counted:
             seconds[name].append(time.perf_counter() - start)
-        pairs[name] = store.coverage.all((2, 3))
+        pairs[name] = np.asarray(store.coverage.all((2, 3)))
     found = summary(seconds, BASELINE)
     counts = {name: (int(mask.any(1).sum()), int(mask.sum())) for name, mask in pairs.items()}
     law = cost_law({name: (*counts[name], found[name]["median_s"]) for name in parts})

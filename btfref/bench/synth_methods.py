@@ -23,6 +23,7 @@ from btfref.numerics.sphere.directions import directions
 
 if TYPE_CHECKING:
     from btfref.mesostructure.base import Mesostructure
+    from btfref.sampling.paths.estimator import Piece
     from btfref.sampling.paths.texels import TexelPaths
     from btfref.types import Facts, JitArray
 
@@ -235,13 +236,13 @@ class SharedPaths(_Subject):
         from btfref.sampling.paths.texels import TexelPaths
 
         class Images(TexelPaths):
-            def _statistics(self, pieces: Sequence[Any]) -> list[tuple[np.ndarray, int]]:
+            def _statistics(self, pieces: Sequence[Piece]) -> list[tuple[np.ndarray, ...]]:
                 import drjit as dr
 
                 mean = (dr.block_sum(self._buffer, self.spp) / self.spp).numpy()
                 ends = np.cumsum([piece.size // self.spp for piece in pieces])[:-1]
                 return [
-                    (part.reshape(len(piece.lights), 3, -1).transpose(0, 2, 1), 0)
+                    (part.reshape(len(piece.lights), 3, -1).transpose(0, 2, 1), np.zeros(()))
                     for piece, part in zip(pieces, np.split(mean, ends), strict=True)
                 ]
 

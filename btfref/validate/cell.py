@@ -185,7 +185,7 @@ def _cell(cache: Cache, spec: Spec, settings: Settings) -> CellResult:
     views = make_views(cache, spec.mesostructure, spec.scene, spec.lights, settings)
     shared = shared_settings(file, spec.lights, settings)
     under = _under_environment if spec.lights in ENVIRONMENTS else _under_deltas
-    chain, reference, image, gates, facts, parts = under(path, spec, views, settings, shared)
+    chain, reference, image, gates, facts, of_stages = under(path, spec, views, settings, shared)
     display = fit_display(views.truth.mean(0), views.classes != PixelClass.BACKGROUND)
     counts = np.isin(views.classes, COUNTED)
     chain = [
@@ -194,7 +194,7 @@ def _cell(cache: Cache, spec: Spec, settings: Settings) -> CellResult:
         *chain,
         Picture("8 bits", eight_bits(image.image, display)[None]),
     ]
-    parts = [part(*each, display) for each in parts]
+    parts = [part(*each, display) for each in of_stages]
     found = waterfall(chain, counts, display, parts=parts)
     comparison = compare(
         image.image, reference.image, classes=views.classes, gate=gates, variance=reference.variance

@@ -92,7 +92,7 @@ def reference_of(
     path, parameters = scene_file(scene), dict(parameters or {})
     description = read_scene(path, parameters, size=size)
     files = {m.material.filename for m in description.meshes if m.material}
-    facts = {
+    facts: Facts = {
         "scene": path.read_text("utf-8"),
         "parameters": {k: v for k, v in parameters.items() if not Path(v).exists()},
         "files": sorted(
@@ -214,7 +214,7 @@ def representation_for(
     refuse_store(Path(method))
     if str(method).endswith(".exr"):
         return Path(method)
-    found = row(method)
+    found = row(str(method))
     if btf is None:
         expected = "a .btf.zarr, or a file of the method"
         raise InputError("a method needs a BTF to be fitted to", field="--btf", expected=expected)
