@@ -1,7 +1,7 @@
 """Run time against error: plans (TOML) over all methods, and suites of their own for what no plan can say.
 
-A plan is run by :mod:`btfref.bench.matrix`. A suite is a module with ``run(*, quick, progress, btf, only) -> dict`` and
-``table(result) -> header, rows``.
+A plan is run by :mod:`btfref.bench.matrix`. A suite is a module with ``run(options) -> dict``, see
+:class:`btfref.bench.options.Options`, and ``table(result) -> header, rows``.
 """
 
 from __future__ import annotations
@@ -19,3 +19,6 @@ SUITES = {
     "reflectance": "btfref.bench.experiments.reflectance",
     "synth": "btfref.bench.synth",
 }
+
+#: Suites that make pictures: those that can write a page.
+PICTURED = ("gbrdf", "lod")

@@ -12,7 +12,7 @@ import operator
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial, reduce
 from pathlib import Path
@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from btfref.bench.options import Options
 from btfref.bench.timing import interleaved, machine, peak_memory, reset_peak, summary
 
 if TYPE_CHECKING:
@@ -55,24 +56,14 @@ METHODS = ("raw", "lpca", "laplacian", "rf_lobes", "gbrdf")
 BASELINE = "whole"
 
 
-def run(
-    *,
-    quick: bool = False,
-    progress: Progress | None = None,
-    btf: SampledBTF | None = None,
-    only: Iterable[str] | None = None,
-) -> Facts:
+def run(options: Options) -> Facts:
     """Costs of parts and shares of scenes.
 
     Parameters
     ----------
-    quick : bool
-        Texels, samples, pictures, rounds and methods as few as a test has time for.
-    progress : callable, optional
-    btf : SampledBTF, optional
-        What the methods are fitted to; default: a checker.
-    only : iterable of str, optional
-        Among "synthesis" and "scenes".
+    options : Options
+        ``quick``: texels, samples, pictures, rounds and methods as few as a test has time for. ``btf``: what the
+        methods are fitted to; default: a checker. ``only``: among "synthesis" and "scenes".
 
     Returns
     -------
@@ -82,13 +73,13 @@ def run(
         of it, and frame time; ``raw``;
         ``parameters``; ``machine``.
     """
-    tell = progress or (lambda *_: None)
-    result = {"suite": "demand", "parameters": {"quick": quick}, "machine": machine()}
+    tell = options.tell
+    result = {"suite": "demand", "parameters": {"quick": options.quick}, "machine": machine()}
     with tempfile.TemporaryDirectory() as folder:
-        if only is None or "synthesis" in only:
-            result["synthesis"] = synthesis(Path(folder), quick, tell)
-        if only is None or "scenes" in only:
-            result["scenes"] = scenes(Path(folder), btf, quick, tell)
+        if options.wants("synthesis"):
+            result["synthesis"] = synthesis(Path(folder), options.quick, tell)
+        if options.wants("scenes"):
+            result["scenes"] = scenes(Path(folder), options.btf, options.quick, tell)
     return result
 
 

@@ -16,7 +16,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,12 +25,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from btfref.bench.data import MESOSTRUCTURES
+from btfref.bench.options import Options
 from btfref.bench.synth_methods import MAX_DEPTH, NAIVE_PAIRS, PAIRS, PATH_VIEWS, REFERENCE_SPP
 from btfref.bench.timing import machine
 from btfref.errors import InputError
 
 if TYPE_CHECKING:
-    from btfref.sampling import SampledBTF
     from btfref.types import Facts, Progress
 
 
@@ -58,24 +58,14 @@ BASE: Facts = {"mesostructure": "checker", "texels": 64, "directions": "ubo81", 
 COST = {"naive": 1, "path": 10, "surface": 10}
 
 
-def run(
-    *,
-    quick: bool = False,
-    progress: Progress | None = None,
-    only: Iterable[str] | None = None,
-    btf: SampledBTF | None = None,
-) -> Facts:
+def run(options: Options) -> Facts:
     """Time and error of full 64² × 81² synthesis.
 
     Parameters
     ----------
-    quick : bool
-        The checker at 16² texels, one round, few runs; the growth at small sizes.
-    progress : callable, optional
-    only : iterable of str, optional
-        Mesostructures instead of all; "growth" for the growth of the cost alone.
-    btf : SampledBTF, optional
-        Not used.
+    options : Options
+        ``quick``: the checker at 16² texels, one round, few runs; the growth at small sizes. ``only``: mesostructures
+        instead of all; "growth" for the growth of the cost alone. ``btf``: not used.
 
     Returns
     -------
@@ -90,15 +80,15 @@ def run(
     InputError
         For a name in ``only`` that there is not.
     """
-    names = list(only or (*(MESOSTRUCTURES[:1] if quick else MESOSTRUCTURES), "growth"))
+    names = list(options.only or (*(MESOSTRUCTURES[:1] if options.quick else MESOSTRUCTURES), "growth"))
     for name in set(names) - {*MESOSTRUCTURES, "growth"}:
         known = ", ".join((*MESOSTRUCTURES, "growth"))
         raise InputError("no such mesostructure", field="--only", got=name, expected=known)
-    settings = _growing(quick) if "growth" in names else []
+    settings = _growing(options.quick) if "growth" in names else []
     names = [name for name in names if name != "growth"]
-    rounds, texels = (1, 16) if quick else (3, 64)
-    count = dict.fromkeys(RUNS, 4) if quick else RUNS
-    steps = _Steps(progress, names, settings, rounds, count)
+    rounds, texels = (1, 16) if options.quick else (3, 64)
+    count = dict.fromkeys(RUNS, 4) if options.quick else RUNS
+    steps = _Steps(options.progress, names, settings, rounds, count)
     result: Facts = {"raw": {}, "errors": {}, "means": {}, "reference": {}, "peak_bytes": {}, "kernel_s": {}}
     with tempfile.TemporaryDirectory() as folder:
         for name in names:

@@ -62,7 +62,7 @@ class Naive:
         # Far enough for shadows from 75 degrees.
         reach = 1 + int(np.ceil(-tile.height[0] * np.tan(np.radians(75))))
         light = {"type": "directional", "direction": [0, 0, -1], "irradiance": 1.0}
-        self.scene = mi.load_dict({"type": "scene", "light": light, **_merged(mi, tile, reach)})
+        self.scene = mi.load_dict({"type": "scene", "light": light, **merged(mi, tile, reach)})
         self.parameters = mi.traverse(self.scene)
         self.integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH})
 
@@ -73,12 +73,16 @@ class Naive:
         self.parameters["light.to_world"] = mi.Transform4f().look_at([0, 0, 0], (-light).tolist(), up)
         self.parameters.update()
         image = mi.render(
-            self.scene, sensor=_camera(mi, view, self.texels), integrator=self.integrator, spp=spp, seed=seed
+            self.scene,
+            sensor=texel_camera(mi, view, self.texels),
+            integrator=self.integrator,
+            spp=spp,
+            seed=seed,
         )
         return np.array(image)
 
 
-def _merged(mi: ModuleType, tile: Mesostructure, reach: int) -> dict[str, JitArray]:
+def merged(mi: ModuleType, tile: Mesostructure, reach: int) -> dict[str, JitArray]:
     """All copies of the tile as one mesh per material: the fastest that we know for a plain render."""
     shapes = {}
     offsets = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2), -1).reshape(-1, 2)
@@ -108,10 +112,15 @@ def _merged(mi: ModuleType, tile: Mesostructure, reach: int) -> dict[str, JitArr
     return shapes
 
 
-def _camera(mi: ModuleType, view: np.ndarray, texels: int) -> JitArray:
-    """An orthographic camera sheared so that pixels are the texels' squares on z = 0."""
+def texel_camera(mi: ModuleType, view: np.ndarray, texels: int) -> JitArray:
+    """An orthographic camera, sheared so that pixel (row, column) sees exactly that texel's square on z = 0.
+
+    Mitsuba's orthographic film spans [−1, 1]² in camera space with +x to the left and +y up, rays along +z. The columns
+    of the matrix are the images of these axes: pixel column → x, pixel row → y, ray → −view.
+    """
     matrix = np.eye(4)
     matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = [-0.5, 0, 0], [0, -0.5, 0], -view
+    # The corner (0, 0) of the tile is pixel (0, 0); the camera stands two units up the view direction.
     matrix[:3, 3] = np.array([0.5, 0.5, 0]) + 2 * view
     film = {
         "type": "hdrfilm",

@@ -12,7 +12,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from btfref.bench import SUITES
+from btfref.bench import PICTURED, SUITES
 from btfref.bench.plan import SUFFIX, shipped
 from btfref.commands.shared.options import add_json, add_only, words
 from btfref.commands.shared.printing import Progress, emit, emit_json, table
@@ -140,8 +140,9 @@ def _compare(args: Namespace) -> int:
 
 def _suite(args: Namespace) -> int:
     import importlib
-    import inspect
     import json
+
+    from btfref.bench.options import Options
 
     out = output_file(args.output, ".jsonl") if args.output else None
     plot = output_file(args.plot, ".png") if args.plot else None
@@ -149,19 +150,17 @@ def _suite(args: Namespace) -> int:
     if plot and args.suite != "synth" and not hasattr(suite, "plot"):
         raise InputError("this suite has no plot", field="--plot", got=args.suite, expected="env or synth")
     only = words(args.only)
-    options: Facts = {"only": only} if only else {}
     if plot and args.suite == "synth" and only and "growth" not in only:
         raise InputError(
             "the plot is that of the growth", field="--only", got=args.only, expected="growth too"
         )
-    if args.report:
-        options["report"] = output_file(args.report, ".html")
-        if "report" not in inspect.signature(suite.run).parameters:
-            raise InputError("this suite has no pictures", field="--report", got=args.suite)
-    if args.btf:
-        options["btf"] = _btf(args)
+    if args.report and args.suite not in PICTURED:
+        raise InputError(
+            "this suite has no pictures", field="--report", got=args.suite, expected=" or ".join(PICTURED)
+        )
+    report = output_file(args.report, ".html") if args.report else None
     with Progress() as progress:
-        result = suite.run(quick=args.quick, progress=progress, **options)
+        result = suite.run(Options(args.quick, progress, _btf(args), only or None, report))
     if out:
         with Path(out).open("a") as stream:
             stream.write(json.dumps(result) + "\n")

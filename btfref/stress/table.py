@@ -50,17 +50,7 @@ def evaluator_table(findings: Sequence[Finding]) -> list[str]:
 
 
 def check_table(findings: Sequence[Finding]) -> list[str]:
-    """Method × check of definitions and fits: the worst figure, where, and its bound.
-
-    Parameters
-    ----------
-    findings : list of Finding
-
-    Returns
-    -------
-    list of str
-        Lines of Markdown.
-    """
+    """Method × check of definitions and fits, as lines of Markdown: the worst figure, where, and its bound."""
     rows = [["check", "method", "data", "worst", "bound", "failures", "what"], ["---"] * 7]
     others = [f for f in findings if f.check != "port"]
     for check in dict.fromkeys(f.check for f in others):

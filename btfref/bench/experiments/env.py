@@ -9,20 +9,20 @@ from __future__ import annotations
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from btfref.bench.options import Options
 from btfref.bench.timing import machine
 from btfref.conventions import PixelClass
 from btfref.scene.shipped import scene_file
 
 if TYPE_CHECKING:
     from btfref.rendering.result import RenderResult
-    from btfref.sampling import SampledBTF
-    from btfref.types import Facts, PathLike, Progress
+    from btfref.types import Facts, PathLike
 
 
 #: Pictures are small: the noise of their references averages out over the sphere.
@@ -41,24 +41,14 @@ ROUNDS = 9
 FRAME = (800, 800)
 
 
-def run(
-    *,
-    quick: bool = False,
-    progress: Progress | None = None,
-    btf: SampledBTF | None = None,
-    only: Iterable[str] | None = None,
-) -> Facts:
+def run(options: Options) -> Facts:
     """Error against order, clusters, components and bits; time of the products and of frames.
 
     Parameters
     ----------
-    quick : bool
-        Every other order, two environments, smaller frames.
-    progress : callable, optional
-    btf : SampledBTF, optional
-        Default: a checker of 32² texels.
-    only : sequence of str, optional
-        Some of "prefiltered", "order", "transfer", "time".
+    options : Options
+        ``quick``: every other order, two environments, smaller frames. ``btf``: default: a checker of 32² texels.
+        ``only``: some of "prefiltered", "order", "transfer", "time".
 
     Returns
     -------
@@ -70,7 +60,7 @@ def run(
     from btfref.representations import save
 
     parts = {"prefiltered": _prefiltered, "order": _order, "transfer": _transfer, "time": _time}
-    btf = btf or checker(texels=32, spp=8, progress=progress)
+    btf = options.btf or checker(texels=32, spp=8, progress=options.progress)
     summary, raw = {}, {}
     with tempfile.TemporaryDirectory() as folder:
 
@@ -81,10 +71,9 @@ def run(
             return path
 
         for done, (name, part) in enumerate(parts.items()):
-            if progress:
-                progress(done, len(parts), name)
-            if only is None or name in only:
-                summary[name], raw[name] = part(fitted, quick)
+            options.tell(done, len(parts), name)
+            if options.wants(name):
+                summary[name], raw[name] = part(fitted, options.quick)
     parameters = {"size": list(SIZE), "grid": GRID, "shape": list(btf.values.shape)}
     return {"suite": "env", "parameters": parameters, "raw": raw, "summary": summary, "machine": machine()}
 

@@ -7,13 +7,14 @@ with chained matrix factorization, 35 minutes of clustering for 4096 texels, and
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.bench.data import MESOSTRUCTURES, material_name, materials
+from btfref.bench.options import Options
 from btfref.bench.timing import machine
 from btfref.errors import InputError
 
@@ -48,25 +49,16 @@ RELMSE_SHARE = 0.1
 N_PICTURES = 64
 
 
-def run(
-    *,
-    quick: bool = False,
-    progress: Progress | None = None,
-    btf: SampledBTF | None = None,
-    only: Iterable[str] | None = None,
-) -> Facts:
+def run(options: Options) -> Facts:
     """Times and errors of the variants.
 
     Parameters
     ----------
-    quick : bool
-        One round instead of three, and the errors of the BTF that is timed alone.
-    progress : callable, optional
-    btf : SampledBTF, optional
-        To be timed and judged. Default: times of a checker of 64² texels at 8 × 8 views and as many lights, 4096
-        samples a texel as in the paper; errors of the three mesostructures with 64² texels and 81² directions.
-    only : iterable of str, optional
-        Of "cmf" and "hf".
+    options : Options
+        ``quick``: one round instead of three, and the errors of the BTF that is timed alone. ``btf``: to be timed and
+        judged. Default: times of a checker of 64² texels at 8 × 8 views and as many lights, 4096 samples a texel as
+        in the paper; errors of the three mesostructures with 64² texels and 81² directions. ``only``: of "cmf" and
+        "hf".
 
     Returns
     -------
@@ -79,16 +71,16 @@ def run(
     from btfref.representations.factored.storage import cluster
     from btfref.sampling.synthesis import synthesize
 
-    variants = {name: v for name, v in VARIANTS.items() if not only or v[0] in only}
+    variants = {name: v for name, v in VARIANTS.items() if not options.only or v[0] in options.only}
     if not variants:
         raise InputError(
-            "nothing to measure", field="--only", got=", ".join(only or ()), expected="cmf or hf"
+            "nothing to measure", field="--only", got=", ".join(options.only or ()), expected="cmf or hf"
         )
-    report = progress or (lambda *_: None)
-    timed = btf or synthesize(
-        "checker", texels=64, views="8x8", lights="8x8", spp=DRAFT_SPP, progress=progress
+    report = options.tell
+    timed = options.btf or synthesize(
+        "checker", texels=64, views="8x8", lights="8x8", spp=DRAFT_SPP, progress=options.progress
     )
-    rounds = 1 if quick else 3
+    rounds = 1 if options.quick else 3
     raw: dict[str, list[float]] = {
         f"{name}, {part}": [] for name in variants for part in ("factorization", "clustering")
     }
@@ -105,12 +97,12 @@ def run(
     median = {name: float(np.median(times)) for name, times in raw.items()}
     n_tables = int(np.prod(timed.texels)) * 3
     errors, ranges = {}, {}
-    if quick or btf is not None:
+    if options.quick or options.btf is not None:
         name = material_name(timed)
         errors[name], ranges[name] = judged(timed, variants, kept, report)
     else:
         kept.clear()
-        for name, data in materials(None, MESOSTRUCTURES, texels=64, spp=SPP, progress=progress):
+        for name, data in materials(None, MESOSTRUCTURES, texels=64, spp=SPP, progress=options.progress):
             errors[name], ranges[name] = judged(data, variants, {}, report)
     return {
         "suite": "factors",

@@ -7,11 +7,11 @@ to 2 times that of local PCA at a tenth of the bytes.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from btfref.bench.options import Options
 from btfref.bench.timing import machine
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from btfref.representations.gbrdf.definition import Representation as Microfacets
     from btfref.representations.protocol import Representation
     from btfref.sampling import SampledBTF
-    from btfref.types import Facts, PathLike, Progress
+    from btfref.types import Facts, Progress
 
 
 #: Pairs of directions whose pictures are compared by colour difference.
@@ -33,27 +33,15 @@ _ENLARGED = 4
 SIZES = (32, 64)
 
 
-def run(
-    *,
-    quick: bool = False,
-    progress: Progress | None = None,
-    btf: SampledBTF | None = None,
-    only: Iterable[str] | None = None,
-    report: PathLike | None = None,
-) -> Facts:
+def run(options: Options) -> Facts:
     """Times and errors.
 
     Parameters
     ----------
-    quick : bool
-        The smaller size only.
-    progress : callable, optional
-    btf : SampledBTF, optional
-        Instead of the checkers; heights are compared with the truth for checkers alone.
-    only : iterable of str, optional
-        Ignored: there is one method.
-    report : path-like, optional
-        HTML page with the maps, where the truth is known.
+    options : Options
+        ``quick``: the smaller size only. ``btf``: instead of the checkers; heights are compared with the truth for
+        checkers alone. ``only``: ignored: there is one method. ``report``: HTML page with the maps, where the truth
+        is known.
 
     Returns
     -------
@@ -65,19 +53,24 @@ def run(
     """
     from btfref.sampling.synthesis import synthesize
 
-    if btf is not None:
-        cases = [btf]
+    if options.btf is not None:
+        cases = [options.btf]
     else:
-        sizes = SIZES[:1] if quick else SIZES
+        sizes = SIZES[:1] if options.quick else SIZES
         cases = [
-            synthesize("checker", texels=n, spp=16, estimator="surface", progress=progress) for n in sizes
+            synthesize("checker", texels=n, spp=16, estimator="surface", progress=options.progress)
+            for n in sizes
         ]
     cells: list[Cell] = []
-    result = {"suite": "gbrdf", "cases": [case(b, progress, cells) for b in cases], "machine": machine()}
-    if report is not None:
+    result = {
+        "suite": "gbrdf",
+        "cases": [case(b, options.progress, cells) for b in cases],
+        "machine": machine(),
+    }
+    if options.report is not None:
         from btfref.report import write_report
 
-        write_report(report, title="Decomposition into g-BRDFs", cells=cells, facts=result["machine"])
+        write_report(options.report, title="Decomposition into g-BRDFs", cells=cells, facts=result["machine"])
     return result
 
 

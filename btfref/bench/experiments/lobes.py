@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from btfref.bench.options import Options
 from btfref.bench.timing import interleaved, machine
 from btfref.numerics.solvers.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from btfref.sampling import SampledBTF
-    from btfref.types import Facts, Progress
+    from btfref.types import Facts
 
 
 LOBES = 2
@@ -33,24 +34,14 @@ PEERS = {
 }
 
 
-def run(
-    *,
-    quick: bool = False,
-    progress: Progress | None = None,
-    btf: SampledBTF | None = None,
-    only: Iterable[str] | None = None,
-) -> Facts:
+def run(options: Options) -> Facts:
     """Seconds per fit and mean error of both.
 
     Parameters
     ----------
-    quick : bool
-        8 fits of the peer instead of 64.
-    progress : callable, optional
-    btf : SampledBTF, optional
-        Default: a checker of 64² texels and 81² directions.
-    only : sequence of str, optional
-        Some of the peers "jacobian", "differences"; the batched solver always runs.
+    options : Options
+        ``quick``: 8 fits of the peer instead of 64. ``btf``: default: a checker of 64² texels and 81² directions.
+        ``only``: some of the peers "jacobian", "differences"; the batched solver always runs.
 
     Returns
     -------
@@ -63,13 +54,13 @@ def run(
     from btfref.representations.analytic import rf_lobes
     from btfref.representations.analytic.lobe_start import lobe_starts
 
-    btf = btf or checker(spp=8, progress=progress)
+    btf = options.btf or checker(spp=8, progress=options.progress)
     lights = btf.lights.vectors
     data = residual_fields(btf)
     start = time.perf_counter()
     whole = rf_lobes.fit(btf).meta["fit"]
     raw: Facts = {"whole fit": time.perf_counter() - start}
-    chosen = np.sort(np.random.default_rng(0).choice(len(data), 8 if quick else 64, replace=False))
+    chosen = np.sort(np.random.default_rng(0).choice(len(data), 8 if options.quick else 64, replace=False))
     some = data[chosen].astype(float)
     starts = lobe_starts(data[chosen], lights, LOBES).astype(float)
     lower, upper = (bound.astype(float) for bound in rf_lobes.lobe_bounds(data[chosen], btf.lights, LOBES))
@@ -91,9 +82,9 @@ def run(
 
         return task
 
-    wanted = {name: gets for short, (name, gets) in PEERS.items() if only is None or short in only}
+    wanted = {name: gets for short, (name, gets) in PEERS.items() if options.wants(short)}
     tasks = {"batched": batched} | {name: peer(name, gets) for name, gets in wanted.items()}
-    raw |= interleaved(tasks, 1 if quick else ROUNDS)
+    raw |= interleaved(tasks, 1 if options.quick else ROUNDS)
     result = found.pop("result")
     found = {"batched": result.parameters[chosen].astype(float), **found}
     own = [seconds / len(data) for seconds in raw["batched"]]

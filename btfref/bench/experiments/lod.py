@@ -9,20 +9,20 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from btfref.bench.options import Options
 from btfref.bench.timing import interleaved, machine, summary
 
 if TYPE_CHECKING:
     from btfref.gates import GateResult
     from btfref.report import Cell
-    from btfref.sampling import SampledBTF
-    from btfref.types import Facts, JitArray, PathLike, Progress
+    from btfref.types import Facts, JitArray, Progress
 
 
 #: Scene: the parameter that moves, and its step between frames.
@@ -42,27 +42,14 @@ SIZE = (256, 256)
 LARGE = (1024, 1024)
 
 
-def run(
-    *,
-    quick: bool = False,
-    progress: Progress | None = None,
-    btf: SampledBTF | None = None,
-    only: Iterable[str] | None = None,
-    report: PathLike | None = None,
-) -> Facts:
+def run(options: Options) -> Facts:
     """Errors, flicker, fetches and times.
 
     Parameters
     ----------
-    quick : bool
-        Two frames, 144 samples.
-    progress : callable, optional
-    btf : SampledBTF, optional
-        Default: a checker of 64² texels.
-    only : sequence of str, optional
-        Among "horizon", "turning", "cost".
-    report : path-like, optional
-        HTML page with the pictures.
+    options : Options
+        ``quick``: two frames, 144 samples. ``btf``: default: a checker of 64² texels. ``only``: among "horizon",
+        "turning", "cost". ``report``: HTML page with the pictures.
 
     Returns
     -------
@@ -74,20 +61,20 @@ def run(
     from btfref.registry import method
     from btfref.representations import save
 
-    btf = btf or checker(spp=16, progress=progress)
-    tell = progress or (lambda *_: None)
-    frames, grid = (2, 12) if quick else (FRAMES, TRUTH)
+    btf = options.btf or checker(spp=16, progress=options.progress)
+    tell = options.tell
+    frames, grid = (2, 12) if options.quick else (FRAMES, TRUTH)
     found: Facts = {}
     raw: Facts = {}
     cells = []
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder) / "bench.laplacian.exr")
-        save(method("laplacian").fit(btf, progress=progress), path)
-        for scene in [s for s in MOVES if only is None or s in only]:
+        save(method("laplacian").fit(btf, progress=options.progress), path)
+        for scene in [s for s in MOVES if options.wants(s)]:
             found[scene], pictures = _moving(scene, path, frames, grid, tell)
             cells.append(_cell(scene, pictures, found[scene]))
-        if only is None or "cost" in only:
-            found["cost"], raw = _cost(path, 5 if quick else 9, tell)
+        if options.wants("cost"):
+            found["cost"], raw = _cost(path, 5 if options.quick else 9, tell)
     result = {
         "suite": "lod",
         "parameters": {"frames": frames, "samples": grid**2, "size": SIZE, "large": LARGE},
@@ -95,11 +82,11 @@ def run(
         "summary": found,
         "machine": machine(),
     }
-    if report is not None:
+    if options.report is not None:
         from btfref.report import write_report
 
         facts = {"machine": result["machine"], "found": found}
-        write_report(report, title="Level of detail", cells=cells, facts=facts)
+        write_report(options.report, title="Level of detail", cells=cells, facts=facts)
     return result
 
 

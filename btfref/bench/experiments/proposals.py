@@ -8,19 +8,19 @@ render, and by samples of the BSDF alone, which shows the proposal itself.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from btfref.bench.options import Options
 from btfref.bench.timing import interleaved, machine, summary
 
 if TYPE_CHECKING:
     from btfref.registry import Method
-    from btfref.sampling import SampledBTF
-    from btfref.types import Facts, PathLike, Progress
+    from btfref.types import Facts, PathLike
 
 
 #: What is compared; ratios are to the first, the guide that all methods share.
@@ -36,24 +36,14 @@ SAMPLES, SIZE = 64, 128
 PICTURES = 4
 
 
-def run(
-    *,
-    quick: bool = False,
-    progress: Progress | None = None,
-    btf: SampledBTF | None = None,
-    only: Iterable[str] | None = None,
-) -> Facts:
+def run(options: Options) -> Facts:
     """Variance and time of each choice, in each light, with and without emitter sampling.
 
     Parameters
     ----------
-    quick : bool
-        Fewer rounds.
-    progress : callable, optional
-    btf : SampledBTF, optional
-        Default: a checker of 64² texels and 81² directions.
-    only : iterable of str, optional
-        Keys of the methods; default: all that have lobes of their own.
+    options : Options
+        ``quick``: fewer rounds. ``btf``: default: a checker of 64² texels and 81² directions. ``only``: keys of the
+        methods; default: all that have lobes of their own.
 
     Returns
     -------
@@ -67,23 +57,22 @@ def run(
     from btfref.registry import methods
     from btfref.representations import save
 
-    btf = btf or checker(spp=8, progress=progress)
+    btf = options.btf or checker(spp=8, progress=options.progress)
     mi = mitsuba_plugins.ready()
     raw, result = {}, {}
     with tempfile.TemporaryDirectory() as folder:
         for key, row in methods().items():
-            if (key not in only) if only else not _has_lobes(row):
+            if (key not in options.only) if options.only else not _has_lobes(row):
                 continue
             path = Path(folder) / f"bench.{key}.exr"
             save(row.fit(btf), path)
             scenes = _scenes(mi)
             for i, (name, scene) in enumerate(scenes.items()):
-                if progress:
-                    progress(i, len(scenes), key)
+                options.tell(i, len(scenes), key)
                 cell = f"{key}, {name}"
                 tasks = {choice: _task(mi, scene, path, choice) for choice in CHOICES}
                 pictures = {choice: [task() for _ in range(PICTURES)] for choice, task in tasks.items()}
-                raw[cell] = interleaved(tasks, 3 if quick else 7)
+                raw[cell] = interleaved(tasks, 3 if options.quick else 7)
                 result[cell] = _efficiency(pictures, summary(raw[cell], CHOICES[0]))
     parameters = {"spp": SAMPLES, "size": SIZE, "pictures": PICTURES, "shape": list(btf.values.shape)}
     return {

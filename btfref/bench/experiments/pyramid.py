@@ -8,18 +8,18 @@ absolute differences over all pairs of directions: both are given, average, leas
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.bench.data import MESOSTRUCTURES, materials
+from btfref.bench.options import Options
 from btfref.bench.timing import machine
 
 if TYPE_CHECKING:
     from btfref.representations.laplacian.definition import Representation
     from btfref.sampling import SampledBTF
-    from btfref.types import Facts, Progress
+    from btfref.types import Facts
 
 
 TEXELS, SPP = 64, 16
@@ -28,24 +28,13 @@ TEXELS, SPP = 64, 16
 COMPONENTS = (1, 2, 3, 4, 6, 8, 10, 12, 16)
 
 
-def run(
-    *,
-    quick: bool = False,
-    progress: Progress | None = None,
-    btf: SampledBTF | None = None,
-    only: Iterable[str] | None = None,
-) -> Facts:
+def run(options: Options) -> Facts:
     """Errors by material, setting, channel and number of components.
 
     Parameters
     ----------
-    quick : bool
-        Checker only.
-    progress : callable, optional
-    btf : SampledBTF, optional
-        Instead of the mesostructures.
-    only : sequence of str, optional
-        Some of the mesostructures.
+    options : Options
+        ``quick``: checker only. ``btf``: instead of the mesostructures. ``only``: some of the mesostructures.
 
     Returns
     -------
@@ -56,11 +45,11 @@ def run(
     """
     from btfref.representations.laplacian import definition as laplacian
 
-    names = only or (MESOSTRUCTURES[:1] if quick else MESOSTRUCTURES)
+    names = options.only or (MESOSTRUCTURES[:1] if options.quick else MESOSTRUCTURES)
     summary: Facts = {}
     raw: Facts = {}
     settings = {"texels": TEXELS, "spp": SPP, "estimator": "surface"}
-    for name, data in materials(btf, names, progress=progress, **settings):
+    for name, data in materials(options.btf, names, progress=options.progress, **settings):
         channels = _channels(data)
         summary[name], raw[name] = {"table": {}, "bytes": {}}, {}
         for setting, parameters in (("paper", laplacian.PRESETS["paper"]), ("default", {})):
@@ -78,7 +67,9 @@ def run(
         }
     return {
         "suite": "pyramid",
-        "parameters": {"texels": TEXELS, "spp": SPP} if btf is None else {"shape": list(btf.values.shape)},
+        "parameters": {"texels": TEXELS, "spp": SPP}
+        if options.btf is None
+        else {"shape": list(options.btf.values.shape)},
         "raw": raw,
         "summary": summary,
         "machine": machine(),

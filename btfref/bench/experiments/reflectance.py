@@ -12,18 +12,19 @@ polynomials; peaks and exponents of lobes need the range of a half.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.bench.data import MESOSTRUCTURES, materials
+from btfref.bench.options import Options
 from btfref.bench.timing import machine
 from btfref.errors import InputError
 
 if TYPE_CHECKING:
     from btfref.sampling import SampledBTF
-    from btfref.types import Facts, Progress
+    from btfref.types import Facts
 
 
 #: The paper's columns.
@@ -33,24 +34,14 @@ METHODS = {"LAF": "lafortune", "SLAF": "lafortune_lut", "RFP": "rf_poly", "RFNL"
 TEXELS, SPP = 32, 16
 
 
-def run(
-    *,
-    quick: bool = False,
-    progress: Progress | None = None,
-    btf: SampledBTF | None = None,
-    only: Iterable[str] | None = None,
-) -> Facts:
+def run(options: Options) -> Facts:
     """ε and seconds of the four methods.
 
     Parameters
     ----------
-    quick : bool
-        Checker only.
-    progress : callable, optional
-    btf : SampledBTF, optional
-        Instead of the mesostructures.
-    only : sequence of str, optional
-        Some of the columns "LAF", "SLAF", "RFP", "RFNL".
+    options : Options
+        ``quick``: checker only. ``btf``: instead of the mesostructures. ``only``: some of the columns "LAF", "SLAF",
+        "RFP", "RFNL".
 
     Returns
     -------
@@ -58,17 +49,19 @@ def run(
         ``summary``: by material and column, ``average``, ``minimum``, ``maximum``, ``seconds``, ``not_converged``, and
         ``storage``: bytes of the maps in floats, in halves and in 8 bits, with ε of each; ``raw``: seconds.
     """
-    columns = {column: key for column, key in METHODS.items() if only is None or column in only}
+    columns = {column: key for column, key in METHODS.items() if options.wants(column)}
     if not columns:
         raise InputError(
-            "no such column", field="only", got=", ".join(only or ()), expected=", ".join(METHODS)
+            "no such column", field="only", got=", ".join(options.only or ()), expected=", ".join(METHODS)
         )
-    names = MESOSTRUCTURES[:1] if quick else MESOSTRUCTURES
+    names = MESOSTRUCTURES[:1] if options.quick else MESOSTRUCTURES
     summary, raw = {}, {}
-    for name, data in materials(btf, names, texels=TEXELS, spp=SPP, progress=progress):
+    for name, data in materials(options.btf, names, texels=TEXELS, spp=SPP, progress=options.progress):
         summary[name] = {column: fitted(data, key) for column, key in columns.items()}
         raw[name] = {column: row["seconds"] for column, row in summary[name].items()}
-    parameters = {"texels": TEXELS, "spp": SPP} if btf is None else {"shape": list(btf.values.shape)}
+    parameters = (
+        {"texels": TEXELS, "spp": SPP} if options.btf is None else {"shape": list(options.btf.values.shape)}
+    )
     return {
         "suite": "reflectance",
         "parameters": parameters,

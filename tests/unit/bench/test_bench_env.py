@@ -3,12 +3,13 @@
 from oracle import oracle_btf
 
 from btfref.bench.experiments import env
+from btfref.bench.options import Options
 from btfref.gates import tolerance
 
 
 def test_transfer_table_and_plot(need, tmp_path):
     need("llvm"), need("gl")
-    result = env.run(quick=True, btf=oracle_btf((8, 8)), only=("transfer",))
+    result = env.run(Options(quick=True, btf=oracle_btf((8, 8)), only=("transfer",)))
     rows = result["summary"]["transfer"]
     by_setting = {(r["matrix_clusters"], r["matrix_components"], r["bits"]): r for r in rows}
     assert by_setting[64, 8, 32]["rmse"] < by_setting[4, 8, 32]["rmse"]

@@ -5,6 +5,7 @@ import pytest
 from PIL import Image
 
 from btfref.bench import synth, synth_methods
+from btfref.bench.options import Options
 from btfref.cli import main
 from btfref.errors import InputError
 from btfref.gates import tolerance
@@ -128,7 +129,7 @@ def test_a_process_that_fails_says_why():
 
 def test_an_unknown_name_is_refused():
     with pytest.raises(InputError) as error:
-        synth.run(only=["chess"])
+        synth.run(Options(only=["chess"]))
     assert error.value.field == "--only"
 
 
