@@ -11,7 +11,7 @@ import numpy as np
 if TYPE_CHECKING:
     from btfref.bench.plan import Entry
     from btfref.registry import Method
-    from btfref.representations.lookup import StoredMaps
+    from btfref.representations.protocol import Representation
     from btfref.sampling import SampledBTF
     from btfref.types import Progress
 
@@ -32,7 +32,7 @@ class Built:
 
     evaluate: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
     payload: int
-    representation: StoredMaps | None = None
+    representation: Representation | None = None
 
 
 def build(
@@ -73,11 +73,11 @@ def build(
     return Built(rep.evaluate, payload_of(rep), rep)
 
 
-def payload_of(rep: StoredMaps) -> int:
+def payload_of(rep: Representation) -> int:
     """Bytes of a representation's maps."""
     from btfref.representations.file.container import payload_bytes
 
-    return payload_bytes({name: (a.shape, a.dtype.name) for name, a in rep.maps.items()}, rep.meta)
+    return payload_bytes({name: (a.shape, a.dtype.name) for name, a in rep.arrays().items()}, rep.meta)
 
 
 def _rank_of_bytes(row: Method, btf: SampledBTF, payload: int, seed: int) -> dict[str, int]:

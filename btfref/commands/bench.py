@@ -18,7 +18,6 @@ from btfref.commands.shared.options import add_json, add_only, words
 from btfref.commands.shared.printing import Progress, emit, emit_json, table
 from btfref.commands.shared.reading import output_file
 from btfref.errors import InputError
-from btfref.types import Facts
 
 if TYPE_CHECKING:
     from btfref.sampling import SampledBTF

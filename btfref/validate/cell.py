@@ -17,7 +17,7 @@ from btfref.comparison.waterfall import Picture, waterfall
 from btfref.conventions import PixelClass
 from btfref.errors import BtfrefError
 from btfref.gates.verdicts import GateResult, missing_reference
-from btfref.images.display import fit_display
+from btfref.images.display import Display, fit_display
 from btfref.numerics.colour import decode_srgb
 from btfref.provenance import code_of
 from btfref.scene.shipped import scene_file

@@ -18,6 +18,7 @@ from btfref.bench.timing import interleaved, machine
 from btfref.numerics.solvers.threads import one_blas_thread
 
 if TYPE_CHECKING:
+    from btfref.numerics.solvers.levenberg import BatchFit
     from btfref.sampling import SampledBTF
     from btfref.types import Facts
 
@@ -64,10 +65,11 @@ def run(options: Options) -> Facts:
     some = data[chosen].astype(float)
     starts = lobe_starts(data[chosen], lights, LOBES).astype(float)
     lower, upper = (bound.astype(float) for bound in rf_lobes.lobe_bounds(data[chosen], btf.lights, LOBES))
-    found = {}
+    found: dict[str, np.ndarray] = {}
+    fits: list[BatchFit] = []
 
     def batched() -> None:
-        found["result"] = rf_lobes.fit_lobes(data, btf.lights, LOBES)
+        fits[:] = [rf_lobes.fit_lobes(data, btf.lights, LOBES)]
 
     def peer(name: str, jacobian: bool) -> Callable[[], None]:
         def task() -> None:
@@ -85,12 +87,12 @@ def run(options: Options) -> Facts:
     wanted = {name: gets for short, (name, gets) in PEERS.items() if options.wants(short)}
     tasks = {"batched": batched} | {name: peer(name, gets) for name, gets in wanted.items()}
     raw |= interleaved(tasks, 1 if options.quick else ROUNDS)
-    result = found.pop("result")
+    result = fits[0]
     found = {"batched": result.parameters[chosen].astype(float), **found}
     own = [seconds / len(data) for seconds in raw["batched"]]
     of_solvers = {}
-    for name, parameters in found.items():
-        model = np.stack([lobes_and_jacobian(p, lights)[0] for p in parameters])
+    for name, lobes in found.items():
+        model = np.stack([lobes_and_jacobian(p, lights)[0] for p in lobes])
         residual = np.pi * (model - some)
         seconds = own if name == "batched" else [t / len(chosen) for t in raw[name]]
         ratios = [a / b for a, b in zip(seconds, own, strict=True)]

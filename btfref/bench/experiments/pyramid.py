@@ -46,13 +46,14 @@ def run(options: Options) -> Facts:
     from btfref.representations.laplacian import definition as laplacian
 
     names = options.only or (MESOSTRUCTURES[:1] if options.quick else MESOSTRUCTURES)
+    paper: Facts = laplacian.PRESETS["paper"]
     summary: Facts = {}
     raw: Facts = {}
     settings = {"texels": TEXELS, "spp": SPP, "estimator": "surface"}
     for name, data in materials(options.btf, names, progress=options.progress, **settings):
         channels = _channels(data)
         summary[name], raw[name] = {"table": {}, "bytes": {}}, {}
-        for setting, parameters in (("paper", laplacian.PRESETS["paper"]), ("default", {})):
+        for setting, parameters in {"paper": paper, "default": {}}.items():
             start = time.perf_counter()
             fitted = laplacian.fit(data, **parameters)
             raw[name][setting] = time.perf_counter() - start
@@ -60,7 +61,7 @@ def run(options: Options) -> Facts:
             summary[name]["table"][setting] = table
             summary[name]["bytes"][setting] = _map_bytes(fitted)
         # Without prediction from compressed levels, fewer components are the first of more.
-        most = laplacian.fit(data, **laplacian.PRESETS["paper"] | {"components": (max(COMPONENTS), 1, 1)})
+        most = laplacian.fit(data, **paper | {"components": (max(COMPONENTS), 1, 1)})
         summary[name]["components"] = {
             n: {k: v["average"] for k, v in _errors(_truncated(most, n).tables(0), channels[0]).items()}
             for n in COMPONENTS
