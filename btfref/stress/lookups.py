@@ -90,6 +90,8 @@ class Mix:
     ----------
     directions, coordinates : tuple of str
         Of ``DIRECTIONS`` and ``COORDINATES``, each as often as the others.
+    plain : float
+        Share that is drawn "anywhere" beside that.
     related : float
         Share of lookups whose directions depend on each other.
     broken : bool
@@ -98,6 +100,7 @@ class Mix:
 
     directions: tuple[str, ...] = DIRECTIONS
     coordinates: tuple[str, ...] = COORDINATES
+    plain: float = 0.0
     related: float = 1 / 3
     broken: bool = True
 
@@ -109,6 +112,7 @@ EVERYTHING = Mix()
 USUAL = Mix(
     ("anywhere", "grazing", "pole", "sample", "between samples", "edge", "seam", "ring"),
     ("anywhere", "negative", "centre", "border", "wrap"),
+    plain=0.2,
     related=0.0,
     broken=False,
 )
@@ -149,7 +153,7 @@ def hard_lookups(
     arrays = representation.arrays()
     drawn, kinds = {}, {}
     for prefix in ("light", "view"):
-        kinds[prefix] = _kinds(rng, mix.directions, DIRECTIONS, n)
+        kinds[prefix] = _kinds(rng, mix.directions, DIRECTIONS, n, mix.plain)
         drawn[prefix] = _directions(rng, kinds[prefix], arrays, prefix)
     relation = np.where(rng.random(n) < mix.related, rng.integers(1, len(RELATIONS), n), 0).astype(np.uint8)
     related = relation > 0
@@ -157,7 +161,7 @@ def hard_lookups(
     sign = np.where(relation[:, None] == RELATIONS.index("equal"), 1, sign)
     with np.errstate(invalid="ignore"):
         drawn["light"] = np.where(related[:, None], drawn["view"] * sign.astype(np.float32), drawn["light"])
-    coordinate = _kinds(rng, mix.coordinates, COORDINATES, n)
+    coordinate = _kinds(rng, mix.coordinates, COORDINATES, n, mix.plain)
     uv = _coordinates(rng, coordinate, representation.meta["texels"])
     lod = _levels(rng, n) if mix.broken else rng.uniform(0, max_lod(representation), n)
     return Lookups(
@@ -171,10 +175,15 @@ def hard_lookups(
     )
 
 
-def _kinds(rng: np.random.Generator, chosen: tuple[str, ...], names: tuple[str, ...], n: int) -> np.ndarray:
+def _kinds(
+    rng: np.random.Generator, chosen: tuple[str, ...], names: tuple[str, ...], n: int, plain: float
+) -> np.ndarray:
     """Indices into ``names``, of the chosen ones alone, shape (n,)."""
     index = np.array([names.index(name) for name in chosen])
-    return index[rng.integers(0, len(chosen), n)].astype(np.uint8)
+    kinds = index[rng.integers(0, len(chosen), n)]
+    if plain:
+        kinds = np.where(rng.random(n) < plain, names.index("anywhere"), kinds)
+    return kinds.astype(np.uint8)
 
 
 def _levels(rng: np.random.Generator, n: int) -> np.ndarray:
