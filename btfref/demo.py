@@ -15,7 +15,7 @@ from btfref.types import Facts, PathLike, Progress
 if TYPE_CHECKING:
     import numpy as np
 
-    from btfref.rendering.result import RenderResult
+    from btfref.rendering import RenderResult
     from btfref.report import Cell
 
 SCENES = ("plane", "sphere", "cloth")

@@ -28,7 +28,7 @@ from btfref.validate.pictures import fitted, make_views, shared_settings, views_
 
 if TYPE_CHECKING:
     from btfref.comparison import Comparison
-    from btfref.rendering.result import RenderResult
+    from btfref.rendering import RenderResult
     from btfref.types import Facts
     from btfref.validate.cache import Cache
     from btfref.validate.matrix import Settings, Spec

@@ -25,7 +25,7 @@ from btfref.validate.method_gates import sampling_gates
 from btfref.validate.own_renderer import EIGHT_BIT, NOISY
 
 if TYPE_CHECKING:
-    from btfref.rendering.result import RenderResult
+    from btfref.rendering import RenderResult
     from btfref.representations.protocol import Representation
     from btfref.sampling import SampledBTF
     from btfref.types import JitArray
@@ -134,7 +134,8 @@ class Bench:
 
         parameters = {"btf": str(self.fit(subject)[1]), "lights": "envmap", "tiling": "4"}
         parameters["environment"] = ENVIRONMENTS[subject[0]]
-        scene, shared = scene_file("sphere"), {"parameters": parameters, "grid": 2, "size": (24, 24)}
+        scene = scene_file("sphere")
+        shared: Facts = {"parameters": parameters, "grid": 2, "size": (24, 24)}
         made = realtime(scene, **shared)
         gates = ENVIRONMENT_GATES[made.meta["environment_path"]]
         if subject not in self._converged:

@@ -125,7 +125,7 @@ def _render(
     from btfref.rendering.offline.reference import render
     from btfref.scene.pixel_classes import pixel_classes
 
-    shared = {"parameters": parameters, "size": size}
+    shared: Facts = {"parameters": parameters, "size": size}
     made: Facts = {"classes": pixel_classes(path, grid=grid, **shared)}
     if delta:
         return made | {"image": render(path, grid=grid, shadows=shadows, **shared).image}

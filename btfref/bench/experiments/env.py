@@ -21,7 +21,7 @@ from btfref.conventions import PixelClass
 from btfref.scene.shipped import scene_file
 
 if TYPE_CHECKING:
-    from btfref.rendering.result import RenderResult
+    from btfref.rendering import RenderResult
     from btfref.types import Facts, PathLike
 
 
