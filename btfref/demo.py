@@ -39,7 +39,7 @@ MESOSTRUCTURE, SPP = "checker", 16
 GRID = 4
 
 #: Paths per pixel of the geometry truth, and its seed (not the synthesis's: their noise must be independent).
-GEOMETRY = {"spp": 64, "seed": 1}
+GEOMETRY: Facts = {"spp": 64, "seed": 1}
 
 #: What the two renderers are judged by; the reasons are in ``btfref/gates/tolerances.toml``.
 GATES = ("image.noise_free", "image.silhouette", "image.background")

@@ -217,7 +217,7 @@ def _pictures(folder: Path, name: str, size: tuple[int, int]) -> Facts:
     return {
         "share_of_map_bytes": maps[0] / maps[1],
         "share_of_file_bytes": files[0] / files[1],
-        "equal_picture": bool(np.array_equal(*images)),
+        "equal_picture": bool(np.array_equal(images[0], images[1])),
     }
 
 

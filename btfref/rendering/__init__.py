@@ -31,3 +31,10 @@ class RenderResult:
     variance: np.ndarray | None = None
     meta: Facts = field(default_factory=dict)
     pictures: np.ndarray | None = None
+
+    @property
+    def batches(self) -> np.ndarray:
+        """The independent pictures, of a result that must have them."""
+        if self.pictures is None:
+            raise ValueError("the renderer kept no independent pictures")
+        return self.pictures

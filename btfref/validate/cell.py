@@ -258,7 +258,7 @@ def _under_environment(path: Path, spec: Spec, views: Views, settings: Settings,
     rng = np.random.default_rng(settings.seed)
     some.flat[rng.choice(there, min(settings.port_pixels, len(there)), replace=False)] = True
     definition = approximate(path, pixels=some, **shared)
-    chain = [Picture("fit", reference.pictures), Picture("real time", image.image[None])]
+    chain = [Picture("fit", reference.batches), Picture("real time", image.image[None])]
     facts = {
         "environment_path": way,
         "reference_spp": reference.meta["spp"],

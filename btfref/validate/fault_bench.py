@@ -20,6 +20,7 @@ from btfref.stress.data import bumpy
 from btfref.stress.evaluators import evaluator
 from btfref.stress.judging import port_agreement
 from btfref.stress.lookups import USUAL, hard_lookups, hemisphere
+from btfref.types import Facts
 from btfref.validate.cell import ENVIRONMENT_GATES, GATES
 from btfref.validate.method_gates import sampling_gates
 from btfref.validate.own_renderer import EIGHT_BIT, NOISY
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
 #: The picture of the faults of the host: a curved surface seen from both sides, and more than one light.
 SCENE, LIGHTS = "cloth", "directional3"
-SETTINGS = {"grid": 4, "size": (48, 48)}
+SETTINGS: Facts = {"grid": 4, "size": (48, 48)}
 
 #: Method → environment: few lights for the one, the maps alone for the other.
 ENVIRONMENTS = {"lpca": "bright-texel", "rf_lobes": "constant"}

@@ -15,6 +15,9 @@ from btfref.validate.material import fit_key, load_material, make_fit, make_mate
 from btfref.validate.matrix import ENVIRONMENTS, LIGHTS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from btfref.representations.protocol import Representation
     from btfref.types import Facts, PathLike
     from btfref.validate.cache import Cache
     from btfref.validate.matrix import Settings, Spec
@@ -101,12 +104,17 @@ def _views(cache: Cache, mesostructure: str, scene: str | Path, lights: str, set
             shadows=False,
             **shared_settings(table, lights, settings),
         )
-        return Views(truth.pictures, pictures.pictures, np.zeros(0, np.float32), classes)
+        return Views(truth.batches, pictures.batches, np.zeros(0, np.float32), classes)
     seen = []
     for store in stores:
         table = method("raw").fit(load_material(store))
-        seen.append(approximate(path, load_file=lambda _, table=table: table, **shared).image)
-    return Views(truth.pictures, seen[0][None], seen[1], classes)
+        seen.append(approximate(path, load_file=_always(table), **shared).image)
+    return Views(truth.batches, seen[0][None], seen[1], classes)
+
+
+def _always(representation: Representation) -> Callable[[str], Representation]:
+    """A loader of files that gives one representation for each."""
+    return lambda file: representation
 
 
 def shared_settings(file: PathLike, lights: str, settings: Settings) -> Facts:

@@ -179,12 +179,14 @@ def _time(fitted: Callable[[str], Path], quick: bool) -> tuple[list[Facts], dict
     size = (200, 200) if quick else FRAME
     scene = read_scene(file, settings["parameters"], size=size)
     lighting = lighting_of(scene, "transfer", transfer=TransferSettings())
+    assert lighting is not None  # the scene has an environment
     with Renderer(scene, lighting=lighting) as renderer:
         light = renderer.transfers[0]
+        full = light.table
         tasks = {
             "products, 32 × 8 × 16 × 4": lambda: light.relight(lighting.coefficients),
             "products while moving, 4 and 1": lambda: light.relight(lighting.coefficients, moving=True),
-            "8-bit codes of them": lambda: transfer_light.encoded(light._full),
+            "8-bit codes of them": lambda: transfer_light.encoded(full),
         }
         for name, task in tasks.items():
             task()

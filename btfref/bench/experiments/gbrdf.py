@@ -62,7 +62,7 @@ def run(options: Options) -> Facts:
             for n in sizes
         ]
     cells: list[Cell] = []
-    result = {
+    result: Facts = {
         "suite": "gbrdf",
         "cases": [case(b, options.progress, cells) for b in cases],
         "machine": machine(),
