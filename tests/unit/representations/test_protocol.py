@@ -70,12 +70,10 @@ def test_fit_modules_satisfy_what_they_should(key):
 
 
 @pytest.mark.parametrize("key", methods())
-def test_evaluators_satisfy_what_they_should(key, fits, llvm):
-    import mitsuba_plugins
+def test_evaluators_satisfy_what_they_should(key, fits, load_plugin):
     from mitsuba_plugins import protocol as ports
 
-    mitsuba_plugins.register()
-    bsdf = llvm.load_dict({"type": "btf", "filename": str(fits.path(key))})
+    bsdf = load_plugin(fits.path(key))
     assert isinstance(bsdf, ports.ShowsMethod)
     expected = {name for name, keys in EVALUATORS.items() if key in keys}
     assert satisfied(bsdf.evaluator, ports, EVALUATORS) == expected
@@ -102,12 +100,10 @@ def test_a_method_from_outside_derives_from_nothing_and_satisfies_them(monkeypat
 
 @pytest.mark.parametrize("around", ["nothing", "twosided", "mask"])
 @pytest.mark.parametrize(("key", "displaced"), [("raw", False), ("gbrdf", True)])
-def test_displaced_materials_are_known_inside_of_others(key, displaced, around, fits, llvm):
-    import mitsuba_plugins
+def test_displaced_materials_are_known_inside_of_others(key, displaced, around, fits, llvm, load_plugin):
     from mitsuba_plugins.protocol import is_displaced
 
-    mitsuba_plugins.register()
-    inner = {"type": "btf", "filename": str(fits.path(key))}
+    inner = load_plugin(fits.path(key))
     if around != "nothing":
         inner = {"type": "twosided", "inner": inner}
     if around == "mask":
