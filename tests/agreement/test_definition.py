@@ -67,7 +67,7 @@ def test_a_flat_mesostructure_is_known(made):
     shared = {"parameters": parameters, "size": SIZE}
     found = render_exact(scene, spp=16, grid=2, **shared)
     lambert = SimpleNamespace(
-        meta={"filter_type": "bilinear"},
+        meta={"filter_type": "bilinear", "texels": [8, 8]},
         evaluate=lambda uv, w_light, w_view: np.maximum(w_light[:, 2:], 0) * np.ones(3) / np.pi,
     )
     expected = approximate(scene, grid=8, load_file=lambda path: lambert, **shared).image
