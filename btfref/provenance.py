@@ -77,6 +77,7 @@ CODE = {
         "btfref/mesostructure",
         "btfref/sampling",
         "btfref/conventions.py",
+        "btfref/precision.py",
         "btfref/validate/material.py",
     ),
     "fit": ("btfref/representations",),
