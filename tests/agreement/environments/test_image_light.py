@@ -113,10 +113,10 @@ FAULTS = {
 @pytest.mark.parametrize("name", FAULTS)
 def test_injected_faults_are_caught(fits, tables, monkeypatch, rng, tmp_path, name):
     sky, file, right, wrong = FAULTS[name]
-    text = (shader_directory() / f"lib/{file}.glsl").read_text()
+    text = (shader_directory() / f"lib/light/{file}.glsl").read_text()
     assert text.count(right) == 1
-    (tmp_path / "lib").mkdir()
-    (tmp_path / f"lib/{file}.glsl").write_text(text.replace(right, wrong))
+    (tmp_path / "lib/light").mkdir(parents=True)
+    (tmp_path / f"lib/light/{file}.glsl").write_text(text.replace(right, wrong))
     rep = fits("rf_lobes")
     environment, own = tables("rf_lobes", rep, sky)
     monkeypatch.setattr(image_light("rf_lobes"), "tables", classmethod(lambda *_: own))
