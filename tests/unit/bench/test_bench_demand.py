@@ -6,6 +6,7 @@ import pytest
 
 from btfref.bench.demand import BASELINE, QUICK_SCENES, TRACED, cost_law, table
 from btfref.bench.demand import run as run_suite
+from btfref.bench.options import Options
 from btfref.cli import main
 from btfref.gates import tolerance
 
@@ -52,7 +53,7 @@ def test_quick_synthesis(need, llvm, capsys):
 def test_quick_scenes(need, fits):
     need("llvm")
     need("gl")
-    result = run_suite(quick=True, btf=fits.btf(), only=["scenes"])
+    result = run_suite(Options(quick=True, btf=fits.btf(), only=("scenes",)))
     scenes = result["scenes"]
     assert set(scenes) == set(QUICK_SCENES)
     for entry in scenes.values():
