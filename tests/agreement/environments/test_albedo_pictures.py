@@ -99,7 +99,7 @@ def test_levels_have_albedos_of_their_own(fits, monkeypatch):
     inside = np.isfinite(filtered).all(-1)
     rep = fits("laplacian")
     finest = lambda uv, w_light, w_view, _: rep.evaluate(uv, w_light, w_view)  # noqa: E731
-    fine = lambda uv, w_view, to_world, *_: albedo(16, NODES, uv, w_view, to_world, finest)  # noqa: E731
+    fine = lambda uv, w_view, to_world, **_: albedo(16, NODES, uv, w_view, to_world, finest)  # noqa: E731
     monkeypatch.setattr(Lighting, "prepared", lambda *_, **__: Prepared("lights", "", {}, fine))
     difference = np.abs(approximate(file, **settings).image - filtered)[inside].max()
     assert difference > 10 * tolerance("environment.furnace.max") * filtered[inside].max()
