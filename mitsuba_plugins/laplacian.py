@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from btfref.numerics.device_arrays import to_device
 from btfref.numerics.footprint import ANISOTROPY
 from btfref.numerics.ycbcr import TO_RGB
 from mitsuba_plugins.lib.analytic import held, safe_power
@@ -85,8 +86,8 @@ class Evaluator(Port):
         self.shapes = [(level["rows"], level["columns"]) for level in levels]
         first = np.cumsum([0, *(r * c for r, c in self.shapes)])[:-1]
         first = np.maximum(first - first[self.base], 0)
-        self.sizes = mi.UInt32(
-            np.array([[r, c, f, 0] for (r, c), f in zip(self.shapes, first, strict=True)]).ravel()
+        self.sizes = to_device(
+            mi.UInt32, [[r, c, f, 0] for (r, c), f in zip(self.shapes, first, strict=True)]
         )
         dr.eval(self.sizes)
         super().__init__(maps)

@@ -7,8 +7,13 @@ import shutil
 import sys
 from pathlib import Path
 
-import numpy as np
-import pytest
+#: Tests that run side by side have a core each: threads of one would only wait for those of the other.
+ONE_CORE = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1
+if ONE_CORE:  # read when the libraries load; programs that a test starts inherit it
+    os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "LP_NUM_THREADS": "1"}
+
+import numpy as np  # noqa: E402
+import pytest  # noqa: E402
 
 DATA = Path(__file__).parent / "data"
 
@@ -123,6 +128,10 @@ def llvm(need):
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
+    if ONE_CORE:
+        import drjit as dr
+
+        dr.set_thread_count(1)
     yield mi
     _free()
 
@@ -134,12 +143,26 @@ def renderers(need):
     need("gl")
 
 
+@pytest.fixture(scope="module")
+def _plugins():
+    """Plugins of a module's tests: making one takes a second, mostly for its tables of sampling."""
+    kept = {}
+    yield kept
+    kept.clear()
+
+
 @pytest.fixture
-def load_plugin(llvm):
-    """``load_plugin(path, **parameters)``: the plugin of a representation's file, in ``llvm_ad_rgb``."""
+def load_plugin(llvm, _plugins):
+    """``load_plugin(path, **parameters)``: the plugin of a file, in ``llvm_ad_rgb``; shared, not to be changed."""
     import mitsuba_plugins
 
-    return mitsuba_plugins.load
+    def load(path, **parameters):
+        key = (str(path), *((name, str(value)) for name, value in sorted(parameters.items())))
+        if key not in _plugins:
+            _plugins[key] = mitsuba_plugins.load(path, **parameters)
+        return _plugins[key]
+
+    return load
 
 
 @pytest.fixture
@@ -164,6 +187,8 @@ def _free_jit_state():
     yield
     if "drjit" in sys.modules:
         _free()
+        # What is left, modules above all, stays: collections of the next module's tests need not look at it again.
+        gc.freeze()
 
 
 def _free():

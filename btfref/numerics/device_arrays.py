@@ -37,7 +37,12 @@ def to_device(kind: type[Any], array: ArrayLike) -> JitArray:
     array = np.asarray(array)
     if dr.depth_v(kind) > 1:
         return kind(*(to_device(dr.value_t(kind), row) for row in array))
-    numbers = {dr.VarType.UInt8: np.uint8, dr.VarType.UInt32: np.uint32, dr.VarType.Float32: np.float32}
+    numbers = {
+        dr.VarType.UInt8: np.uint8,
+        dr.VarType.UInt32: np.uint32,
+        dr.VarType.Float16: np.float16,
+        dr.VarType.Float32: np.float32,
+    }
     dtype = np.dtype(numbers[dr.type_v(kind)])
     memory = np.zeros(array.size * dtype.itemsize + ALIGNMENT, np.uint8)
     first = -memory.ctypes.data % ALIGNMENT

@@ -27,7 +27,8 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
     """``with loaded(scene, parameters, variant=…, size=…) as mitsuba_scene``; restores the variant.
 
     ``plain`` loads the shapes alone: materials become diffuse, and BTF files need not exist. ``kept`` says which
-    maps are loaded: file to the materials' parameters ``views``, ``lights``, ``entries`` and ``levels``.
+    maps are loaded: file to the materials' parameters ``views``, ``lights``, ``entries`` and ``levels``. Without
+    ``sampled`` nobody draws light directions, and materials are spared the tables for it.
     """
 
     def __init__(
@@ -39,12 +40,13 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
         size: tuple[int, int] | None = None,
         plain: bool = False,
         kept: Kept | None = None,
+        sampled: bool = True,
     ) -> None:
-        self._arguments = scene, parameters, variant, size, plain, kept
+        self._arguments = scene, parameters, variant, size, plain, kept, sampled
         self._before = None
 
     def __enter__(self) -> JitArray:
-        scene, parameters, variant, size, plain, kept = self._arguments
+        scene, parameters, variant, size, plain, kept, sampled = self._arguments
         if variant.startswith("llvm"):
             from btfref.platform import prepare_llvm
 
@@ -65,7 +67,11 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
             if plain:
                 parsing.plain(parsed)
             for node in parsed.nodes:
-                if kept and node.props.plugin_name() == parsing.BTF:
+                if node.props.plugin_name() != parsing.BTF:
+                    continue
+                if not sampled:
+                    node.props["sampling"] = "cosine"
+                if kept:
                     for name, chosen in kept[node.props["filename"]].items():
                         if chosen is not None:
                             node.props[name] = " ".join(map(str, chosen))

@@ -69,7 +69,7 @@ def pixel_classes(
     ndarray of uint8, shape (H, W)
         Codes of `PixelClass`.
     """
-    with loaded(scene, parameters, variant=variant, size=size) as made:
+    with loaded(scene, parameters, variant=variant, size=size, sampled=False) as made:
         shape, point, normal, front, footprint, ambiguous = _hits(made, grid)
         jumps = _displaced_edges(made, grid)
     hit = shape > 0

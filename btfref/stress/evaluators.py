@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from btfref import conventions
 from btfref.errors import InputError
+from btfref.numerics.device_arrays import to_device
 from btfref.precision import computing_in
 
 if TYPE_CHECKING:
@@ -174,7 +175,8 @@ class DrJit(Evaluator):
         if filter_type is not None:
             parameters["filter_type"] = filter_type
         self._mi, self._fast = mitsuba_plugins.ready(), fast
-        self.plugin = mitsuba_plugins.load(path, **parameters)
+        # Nothing is sampled here: tables to sample by would take most of the time to load.
+        self.plugin = mitsuba_plugins.load(path, **{"sampling": "cosine", **parameters})
 
     def prepare(
         self, uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray, *, lod: ArrayLike | None = None
@@ -186,12 +188,10 @@ class DrJit(Evaluator):
 
         mi, context = self._mi, self._mi.BSDFContext()
         si = surface(mi, len(uv), np.asarray(uv).T, np.asarray(w_view).T)
-        light = mi.Vector3f(np.ascontiguousarray(np.asarray(w_light).T))
+        light = to_device(mi.Vector3f, np.asarray(w_light).T)
         # A level for each lookup is no parameter of the plugin: it goes to the plugin's evaluator directly.
         own_levels = lod is not None and isinstance(self.plugin.evaluator, LevelledEvaluator)
-        levels = (
-            mi.Float(np.broadcast_to(np.asarray(lod, np.float32), len(uv)).copy()) if own_levels else None
-        )
+        levels = to_device(mi.Float, np.broadcast_to(lod, len(uv))) if own_levels else None
         dr.eval(si, light, levels)
 
         def compute() -> JitArray:
@@ -347,7 +347,7 @@ def surface(mi: ModuleType, n: int, uv: ArrayLike, w_view: ArrayLike) -> JitArra
 
     def column(values: np.ndarray) -> JitArray:
         # A single place is data, not code: one kernel serves all.
-        return dr.opaque(mi.Float, float(values)) if np.ndim(values) == 0 else mi.Float(values)
+        return dr.opaque(mi.Float, float(values)) if np.ndim(values) == 0 else to_device(mi.Float, values)
 
     si = dr.zeros(mi.SurfaceInteraction3f, n)
     si.uv = mi.Point2f(*map(column, np.asarray(uv)))

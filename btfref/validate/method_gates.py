@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from btfref.gates.verdicts import GateResult, Measured, judge
+from btfref.numerics.device_arrays import to_device
 from btfref.stress.evaluators import EVALUATORS, PORTS, evaluator, surface
 from btfref.stress.judging import port_agreement
 from btfref.stress.lookups import USUAL, hard_lookups, unit
@@ -116,7 +117,9 @@ def _weights(
     """Largest error of weight × density against the value, and of the density, relative."""
     rng, context = np.random.default_rng(5), mi.BSDFContext()
     si = surface(mi, n, uv, w_view)
-    bs, weight = plugin.sample(context, si, mi.Float(rng.random(n)), mi.Point2f(rng.random((2, n))))
+    bs, weight = plugin.sample(
+        context, si, to_device(mi.Float, rng.random(n)), to_device(mi.Point2f, rng.random((2, n)))
+    )
     value, pdf = np.array(plugin.eval(context, si, bs.wo)), np.array(plugin.pdf(context, si, bs.wo))
     floor = 1e-3 * max(float(np.abs(value).max()), 1e-30)
     error = np.abs(np.array(weight) * pdf - value) / np.maximum(np.abs(value), floor)

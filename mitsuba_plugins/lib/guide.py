@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from btfref.numerics.device_arrays import to_device
 from btfref.numerics.sphere import interpolation
 from btfref.representations.protocol import HasLevels
 
@@ -34,6 +35,9 @@ ALIAS_BITS = N_CELLS.bit_length() - 1
 #: Share of pure cosine sampling: bounds the weight of a sample by 1 / share times that of cosine sampling, for texels
 #: that differ from their group's mean.
 COSINE_SHARE = 0.4
+
+#: Alias tables that are made at once: what this many need stays in a core's own cache.
+_BLOCK = 64
 
 #: Points per side of a cell over which B / cos θ is averaged.
 _SUBSAMPLES = 4
@@ -82,7 +86,12 @@ def cell_densities(mean: np.ndarray, lights: Interpolation) -> np.ndarray:
 
 
 def alias_tables(weights: np.ndarray, bits: int = ALIAS_BITS) -> np.ndarray:
-    """Alias tables (Walker 1977, in Vose's construction, all rows at once).
+    """Alias tables (Walker 1977), all rows at once.
+
+    Two sweeps fill a table, one over the cells below the mean, one over those above: each poor cell is filled by the
+    rich one that the sweep stands at, and a rich cell that has given away its surplus is filled by the next rich one.
+    Where the sweeps stand follows from prefix sums of deficits and surpluses (Hübschle-Schneider and Sanders 2022,
+    "Parallel Weighted Random Sampling", section 4.3), so that no loop goes over cells.
 
     Parameters
     ----------
@@ -96,29 +105,33 @@ def alias_tables(weights: np.ndarray, bits: int = ALIAS_BITS) -> np.ndarray:
     ndarray of uint32, shape (n_tables, n)
         Threshold in steps of 2^(bits − 32) above the ``bits`` low bits, which hold the alias. See :func:`drawn`.
     """
+    tables = np.zeros(weights.shape, np.uint32)
+    for first in range(0, len(weights), _BLOCK):
+        block = slice(first, first + _BLOCK)
+        tables[block] = _alias_tables(weights[block], bits)
+    return tables
+
+
+def _alias_tables(weights: np.ndarray, bits: int) -> np.ndarray:
     n_tables, n = weights.shape
-    share = np.asarray(weights, float) * (n / weights.sum(1, keepdims=True))
-    order = np.argsort(share, axis=1)
-    row = np.arange(n_tables)
-    threshold, alias = np.ones((n_tables, n)), np.tile(np.arange(n), (n_tables, 1))
-    # Cells sorted by share: ``small`` walks up from the poorest, ``large`` down from the richest. A rich cell that has
-    # given away its surplus is the next poor one.
-    small, large = np.zeros(n_tables, int), np.full(n_tables, n - 1)
-    poor = order[row, small]
-    for _ in range(n - 1):
-        rich = order[row, large]
-        threshold[row, poor] = np.minimum(share[row, poor], 1)
-        alias[row, poor] = rich
-        share[row, rich] -= 1 - threshold[row, poor]
-        exhausted = (share[row, rich] < 1) & (large - 1 > small)
-        small = np.where(exhausted, small, small + 1)
-        poor = np.where(exhausted, rich, order[row, np.minimum(small, n - 1)])
-        large = np.where(exhausted, large - 1, large)
-        # A table whose walkers met is done: the rest keeps itself.
-        poor = np.where(small >= large, order[row, large], poor)
+    surplus = np.asarray(weights, float) * (n / weights.sum(1, keepdims=True)) - 1
+    poor = surplus < 0
+    lacking, spare = np.cumsum(np.where(poor, -surplus, 0), 1), np.cumsum(np.where(poor, 0, surplus), 1)
+    # Rows one after the other on one axis: neither sum reaches n.
+    start = 2.0 * n * np.arange(n_tables)[:, None]
+    first, end = n * np.arange(n_tables)[:, None], n - 1
+    # A poor cell takes from the first rich one with something left after the poor ones before it; a rich one that
+    # is used up takes from the next.
+    reached = np.where(poor, lacking + surplus, spare)
+    alias = np.searchsorted((spare + start).ravel(), reached + start, side="right") - first
+    emptied = np.searchsorted((lacking + start).ravel(), spare + start) - first
+    left = 1 + spare - np.take_along_axis(lacking, np.minimum(emptied, end), 1)
+    threshold = np.clip(np.where(poor, 1 + surplus, np.where(emptied > end, 1, left)), 0, 1)
+    # The last of either kind keeps itself: what the sums' rounding leaves is not given away.
+    threshold = np.where(alias > end, 1, threshold)
     most = 1 << (32 - bits)
-    steps = np.round(threshold * most).astype(np.uint32)
-    return np.minimum(steps, most - 1) << bits | alias.astype(np.uint32)
+    steps = np.minimum(np.round(threshold * most).astype(np.uint32), most - 1)
+    return steps << bits | np.minimum(alias, end).astype(np.uint32)
 
 
 def drawn(
@@ -163,16 +176,18 @@ class LightGuide:
     """
 
     def __init__(self, representation: Representation, views: DirectionTable, sampling: str) -> None:
-        if sampling == "data" and isinstance(representation, HasLevels):
-            levels = range(representation.sampling_levels)
-            tables = [representation.sampling_tables(level) for level in levels]
+        self.uniform = sampling == "cosine"
+        if self.uniform:
+            # The same for all texels and views: nothing of the representation is looked at.
+            self.shapes, group = [(1, 1)], np.zeros((1, 1), np.uint32)
+            density = np.ones((1, 1, N_CELLS), np.float32)
         else:
-            tables = [representation.sampling_tables()]
-        self.shapes = [group.shape for group, _ in tables]
-        if sampling == "cosine":
-            group, n_views = np.zeros(self.shapes[0], np.uint32), tables[0][1].shape[1]
-            density = np.ones((1, n_views, N_CELLS), np.float32)
-        else:
+            if isinstance(representation, HasLevels):
+                levels = range(representation.sampling_levels)
+                tables = [representation.sampling_tables(level) for level in levels]
+            else:
+                tables = [representation.sampling_tables()]
+            self.shapes = [group.shape for group, _ in tables]
             lights = interpolation.from_arrays(representation.arrays(), "light")
             density = np.concatenate([cell_densities(mean, lights) for _, mean in tables])
             first = np.cumsum([0, *(len(mean) for _, mean in tables)])
@@ -180,12 +195,12 @@ class LightGuide:
         self.views = views
         self.n_views = density.shape[1]
         self.single_group = density.shape[0] == 1
-        self.group = mi.UInt32(np.ascontiguousarray(group, np.uint32).ravel())
-        self.density = mi.Float(density.ravel())
-        self.alias = mi.UInt32(alias_tables(density.reshape(-1, N_CELLS)).ravel())
+        self.group = to_device(mi.UInt32, group)
+        self.density = to_device(mi.Float, density)
+        self.alias = to_device(mi.UInt32, alias_tables(density.reshape(-1, N_CELLS)))
         start = np.cumsum([0, *(rows * columns for rows, columns in self.shapes)])
         sizes = [[*shape, at, 0] for shape, at in zip(self.shapes, start, strict=False)]
-        self.sizes = mi.UInt32(np.array(sizes, np.uint32).ravel())
+        self.sizes = to_device(mi.UInt32, sizes)
         dr.eval(self.group, self.density, self.alias, self.sizes)
 
     def _first_table(self, uv: JitArray, lod: JitArray) -> JitArray:
@@ -207,6 +222,8 @@ class LightGuide:
         self, uv: JitArray, w_view: JitArray, lod: JitArray = None
     ) -> list[tuple[JitArray, JitArray]]:
         """Tables that the view direction blends, as a list of (table, weight); weights sum to 1."""
+        if self.uniform:
+            return [(mi.UInt32(0), mi.Float(1))]
         first = self._first_table(uv, lod)
         return [
             (first + view, weight)

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from btfref.conventions import LEAST_Z, SQUARED_LENGTHS
+from btfref.numerics.device_arrays import to_device
 from btfref.numerics.sphere.interpolation import MISSING
 
 if TYPE_CHECKING:
@@ -195,8 +196,8 @@ class TriangleTable:
 
     def __init__(self, triangles: np.ndarray, cells: np.ndarray) -> None:
         self.n_triangles, self.n_cells = len(triangles), len(cells)
-        self.triangles = mi.Float(np.asarray(triangles, np.float32).ravel())
-        self.cells = mi.UInt32(np.asarray(cells, np.uint32).ravel())
+        self.triangles = to_device(mi.Float, triangles)
+        self.cells = to_device(mi.UInt32, cells)
 
     def following(self) -> None:
         """There are no rings."""
@@ -259,7 +260,7 @@ class ResidentTable:
 
     def __init__(self, inner: RingTable | TriangleTable, slots: np.ndarray) -> None:
         self.inner, self._table = inner, np.ascontiguousarray(slots[:, 0])
-        self.slots = mi.UInt32(self._table)
+        self.slots = to_device(mi.UInt32, self._table)
         dr.eval(self.slots)
 
     def following(self) -> np.ndarray | None:

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from btfref.conventions import LUMINANCE
+from btfref.numerics.device_arrays import to_device
 from btfref.numerics.sphere.parabolic import texel_centres, texel_solid_angles
 from mitsuba_plugins.lib.guide import alias_tables, drawn
 from mitsuba_plugins.lib.proposals import COSINE_SHARE, folded
@@ -51,8 +52,8 @@ class HalfVectors:
             / np.where(total > 0, total, inside.sum())[:, None]
         )
         self.bits = max((self.n * self.n - 1).bit_length(), 1)
-        self.alias = mi.UInt32(alias_tables(share, self.bits).ravel())
-        self.share, self.total = mi.Float(share.ravel()), mi.Float(total)
+        self.alias = to_device(mi.UInt32, alias_tables(share, self.bits))
+        self.share, self.total = to_device(mi.Float, share), to_device(mi.Float, total)
         dr.eval(self.alias, self.share, self.total)
 
     def sample(self, material: JitArray, sample: JitArray) -> JitArray:

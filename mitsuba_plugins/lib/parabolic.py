@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from btfref.numerics.device_arrays import to_device
 from btfref.numerics.sphere.halfway import LENGTHEN, SHORT
 from btfref.representations.factored.definition import raised
 from mitsuba_plugins.lib.tables import HALF_LIMIT, HALF_SCALE, HALF_SHIFT, as_float32, read_packets, widened
@@ -81,7 +82,7 @@ class ParabolicMaps:
         if self.kind == "halves" and np.abs(halves := values.numpy()).max(initial=0) <= HALF_LIMIT:
             # The shift keeps subnormal halves from being flushed (see HALF_SHIFT).
             words = (halves * np.float16(HALF_SHIFT)).view(np.uint32)
-            self.values = dr.reinterpret_array(mi.Float, mi.UInt32(np.ascontiguousarray(words).ravel()))
+            self.values = dr.reinterpret_array(mi.Float, to_device(mi.UInt32, words))
             dr.eval(self.values)
             self.kind = "words"
         elif self.kind != dr.VarType.UInt32:

@@ -11,6 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from btfref.numerics.device_arrays import to_device
+
 if TYPE_CHECKING:
     from btfref.types import JitArray
     from mitsuba_plugins.lib.lookup import Neighbour
@@ -32,13 +34,20 @@ HALF_SCALE = 2.0**112 / HALF_SHIFT
 UNROLLED_WIDTH = 8
 
 
+#: Arrays of more bytes share their memory with NumPy: so large a block has pages of its own, which begin alike (see
+#: `to_device`), and a copy would cost.
+SHARED_ABOVE = 32 << 20
+
+
 def tensor(array: np.ndarray) -> JitArray:
     """A Dr.Jit tensor of the array's own type (float16, float32 or uint32); uint8 in words of four codes."""
     array = np.ascontiguousarray(array)
     if array.dtype == np.uint8:
         array = array.view("<u4").astype(np.uint32)
     kind = {"float16": mi.TensorXf16, "float32": mi.TensorXf, "uint32": mi.TensorXu}[array.dtype.name]
-    return kind(array)
+    if array.nbytes > SHARED_ABOVE:
+        return kind(array)
+    return kind(to_device(dr.array_t(kind), array), array.shape)
 
 
 class PairTable:
@@ -78,7 +87,7 @@ class PairTable:
         else:
             words = halves[..., self.following, :].astype(np.uint32) << 16
             words |= halves
-        self.words = dr.reinterpret_array(mi.Float, mi.UInt32(words.ravel()))
+        self.words = dr.reinterpret_array(mi.Float, to_device(mi.UInt32, words))
         dr.eval(self.words)
 
     def combine(

@@ -12,7 +12,7 @@ from btfref.registry import methods
 from btfref.stress.evaluators import EVALUATORS, PORTS
 from btfref.stress.judging import port_agreement
 
-N_PROBES = 24_000
+N_PROBES = 12_000
 SETS = ("ubo81", "scattered")
 
 

@@ -14,7 +14,7 @@ from btfref.stress.judging import port_agreement
 #: Sets of directions: test_evaluators.py has the others.
 SETS = ("shifted", "triangles")
 
-N_POINTS = 20_000
+N_POINTS = 10_000
 
 
 @pytest.mark.parametrize("kind", SETS)

@@ -8,6 +8,7 @@ from probes import probe_points
 from btfref.comparison import compare
 from btfref.comparison.comparison import agreement
 from btfref.gates.tolerances import tolerance
+from btfref.numerics.device_arrays import to_device
 from btfref.numerics.footprint import cone_footprint, probe_weight
 from btfref.rendering.gl.renderer import realtime
 from btfref.rendering.offline.reference import render
@@ -119,11 +120,11 @@ def test_the_plugin_averages_along_the_footprint(made, fits, llvm, load_plugin, 
     si = surface(mi, n, uv.T, w_view.T)
     si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
     frame = [np.array(v).T for v in (si.sh_frame.s, si.sh_frame.t)]
-    si.dp_du, si.dp_dv = mi.Vector3f(dp_du.T), mi.Vector3f(dp_dv.T)
+    si.dp_du, si.dp_dv = to_device(mi.Vector3f, dp_du.T), to_device(mi.Vector3f, dp_dv.T)
     si.t = mi.Float(distance)
     light = np.array([0.3, -0.2, 0.9]) / np.linalg.norm([0.3, -0.2, 0.9])
     bsdf = load_plugin(path, to_uv=to_uv, pixel_angle=angle)
-    found = np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(light))).T
+    found = np.array(bsdf.eval(mi.BSDFContext(), si, to_device(mi.Vector3f, light))).T
 
     world = w_view[:, :1] * frame[0] + w_view[:, 1:2] * frame[1] + w_view[:, 2:] * [0, 0, 1]
     area = dp_du[:, 0] * dp_dv[:, 1] - dp_du[:, 1] * dp_dv[:, 0]
@@ -155,13 +156,13 @@ def test_the_plugin_averages_along_the_footprint(made, fits, llvm, load_plugin, 
     w = 6.0
     si.duv_dx, si.duv_dy = mi.Vector2f(w / columns, 0), mi.Vector2f(0, w / rows)
     plain = load_plugin(path, pixel_angle=angle)
-    found = np.array(plain.eval(mi.BSDFContext(), si, mi.Vector3f(light))).T
+    found = np.array(plain.eval(mi.BSDFContext(), si, to_device(mi.Vector3f, light))).T
     expected = representation.evaluate(uv, light, w_view, lod=0.5 * np.log2(1 + w * w / 5))
     for gate in agreement(found, expected, gate="lod.footprint").gates:
         assert gate.passed, gate.line
     # Distance alone, as in the paper; the camera's place goes before the ray's length.
     far = load_plugin(path, lod="distance", lod_unit=2.0, camera=mi.ScalarPoint3f(0, 0, 8))
-    found = np.array(far.eval(mi.BSDFContext(), si, mi.Vector3f(light))).T
+    found = np.array(far.eval(mi.BSDFContext(), si, to_device(mi.Vector3f, light))).T
     for gate in agreement(found, representation.evaluate(uv, light, w_view, lod=2.0)).gates:
         assert gate.passed, gate.line
     assert dr.width(si) == n

@@ -5,6 +5,7 @@ import pytest
 from oracle import oracle_btf
 
 from btfref.gates.tolerances import tolerance
+from btfref.numerics.device_arrays import to_device
 from btfref.registry import methods
 from btfref.representations import save
 from btfref.stress.evaluators import surface
@@ -16,7 +17,9 @@ VIEWS = {
     name: unit(np.array(w))
     for name, w in {"normal": (0.0, 0, 1), "oblique": (0.6, 0.2, 0.7), "grazing": (0.9, -0.3, 0.02)}.items()
 }
-SAMPLES = 1_000_000
+
+#: Of each χ² test by default, and in the long run.
+SAMPLES, MANY_SAMPLES = 250_000, 1_000_000
 
 #: Methods that propose directions by lobes or microfacets of their own: a test holds that these are all.
 OWN = ("rf_lobes", "lafortune", "lafortune_lut", "gbrdf")
@@ -46,11 +49,11 @@ def test_these_methods_have_lobes_of_their_own(llvm):
     assert having == set(OWN)
 
 
-def assert_samples_follow_the_density(mi, bsdf, view, uvs):
-    """χ² of a million samples a place; significance Šidák-corrected over all that may be made."""
+def assert_samples_follow_the_density(mi, bsdf, view, uvs, samples=SAMPLES):
+    """χ² at each place; significance Šidák-corrected over all that may be made."""
     n_tests = len(VIEWS) * len(UVS) * len(CASES)
     for uv in uvs:
-        right, message = chi_square(mi, bsdf, uv, VIEWS[view], samples=SAMPLES, tests=n_tests)
+        right, message = chi_square(mi, bsdf, uv, VIEWS[view], samples=samples, tests=n_tests)
         assert right, message
 
 
@@ -64,7 +67,7 @@ def test_samples_follow_the_density(case, view, llvm, load_plugin):
 @pytest.mark.long
 @pytest.mark.parametrize("view", VIEWS)
 def test_samples_follow_the_density_everywhere(case, view, llvm, load_plugin):
-    assert_samples_follow_the_density(llvm, load_plugin(case[0], **case[1]), view, UVS)
+    assert_samples_follow_the_density(llvm, load_plugin(case[0], **case[1]), view, UVS, MANY_SAMPLES)
 
 
 def grid(n_theta=192, n_phi=384):
@@ -91,7 +94,7 @@ def test_density_integrates_to_one(case, view, llvm, load_plugin):
     bsdf = load_plugin(case[0], **case[1])
     w, solid_angle = grid()
     si = surface(mi, len(UVS) * len(w), np.repeat(UVS, len(w), 0).T, VIEWS[view])
-    pdf = np.array(bsdf.pdf(mi.BSDFContext(), si, mi.Vector3f(np.tile(w, (len(UVS), 1)).T)))
+    pdf = np.array(bsdf.pdf(mi.BSDFContext(), si, to_device(mi.Vector3f, np.tile(w, (len(UVS), 1)).T)))
     integral = pdf.reshape(len(UVS), -1) @ solid_angle
     assert np.abs(integral - 1).max() <= tolerance("pdf.integral.max")
 
@@ -99,12 +102,22 @@ def test_density_integrates_to_one(case, view, llvm, load_plugin):
 @pytest.mark.parametrize("view", VIEWS)
 def test_weight_is_value_over_density(case, view, llvm, load_plugin, rng):
     """sample() returns eval/pdf and its own pdf(); eval_pdf() is the pair of both."""
+    import drjit as dr
+
     mi = llvm
     bsdf, context, n = load_plugin(case[0], **case[1]), mi.BSDFContext(), len(UVS) << 15
     si = surface(mi, n, np.repeat(UVS, 1 << 15, 0).T, VIEWS[view])
-    bs, weight = bsdf.sample(context, si, mi.Float(rng.random(n)), mi.Point2f(rng.random((2, n))))
-    value, pdf = bsdf.eval(context, si, bs.wo), np.array(bsdf.pdf(context, si, bs.wo))
-    both = bsdf.eval_pdf(context, si, bs.wo)
+    bs, weight = bsdf.sample(
+        context, si, to_device(mi.Float, rng.random(n)), to_device(mi.Point2f, rng.random((2, n)))
+    )
+    dr.eval(bs, weight)  # one kernel for what is sampled, one for all that is asked about it
+    value, pdf, both = (
+        bsdf.eval(context, si, bs.wo),
+        bsdf.pdf(context, si, bs.wo),
+        bsdf.eval_pdf(context, si, bs.wo),
+    )
+    dr.eval(value, pdf, both)
+    pdf = np.array(pdf)
     value, weight = np.array(value), np.array(weight)
     scale = np.abs(value).reshape(3, len(UVS), -1).max((0, 2)).repeat(1 << 15)
     assert (pdf > 0).all()
@@ -133,7 +146,7 @@ def test_variance_is_at_most_that_of_cosine_sampling(case, view, llvm, load_plug
     w, solid_angle = grid(48, 128)
     uv = np.random.default_rng(11).random((N_VARIANCE_TEXELS, 2))
     si = surface(mi, len(uv) * len(w), np.repeat(uv, len(w), 0).T, VIEWS[view])
-    w_light = mi.Vector3f(np.tile(w, (len(uv), 1)).T)
+    w_light = to_device(mi.Vector3f, np.tile(w, (len(uv), 1)).T)
 
     def table(values):
         return np.array(values, float).reshape(-1, len(uv), len(w)).mean(0)
@@ -199,7 +212,7 @@ def test_sampling_at_every_level_of_detail(fits, lod, llvm, load_plugin):
     w, solid_angle = grid(48, 128)
     uv = np.random.default_rng(11).random((32, 2))
     si = surface(mi, len(uv) * len(w), np.repeat(uv, len(w), 0).T, w_view)
-    w_light = mi.Vector3f(np.tile(w, (len(uv), 1)).T)
+    w_light = to_device(mi.Vector3f, np.tile(w, (len(uv), 1)).T)
     value = np.array(bsdf.eval(context, si, w_light), float).reshape(3, len(uv), len(w)).mean(0)
     density = np.array(bsdf.pdf(context, si, w_light), float).reshape(len(uv), len(w))
     first = value @ solid_angle

@@ -56,7 +56,7 @@ def test_workers_write_the_same_bytes(tmp_path, cluster, extra):
 
 
 @pytest.mark.filterwarnings("default")
-@pytest.mark.parametrize("workers", [1, 4])
+@pytest.mark.parametrize("workers", [1, pytest.param(4, marks=pytest.mark.long)])
 def test_the_number_of_workers_changes_no_byte(need, tmp_path, workers):
     """A cluster of one and one of four, started by the synthesis itself; the one of two is above."""
     need("distributed")

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from btfref.errors import InputError
+from btfref.numerics.device_arrays import to_device
 from btfref.numerics.solvers.clustering import leading_axes, local_pca
 from btfref.numerics.solvers.lowrank import range_basis
 from btfref.numerics.sphere import harmonics
@@ -235,8 +236,8 @@ def _diffuse(mesh: MeshDescription, w: np.ndarray, y: np.ndarray) -> list[np.nda
 def _mitsuba_mesh(mi: JitArray, mesh: MeshDescription, number: int) -> JitArray:
     made = mi.Mesh(f"mesh_{number}", len(mesh.positions), len(mesh.faces))
     values = mi.traverse(made)
-    values["vertex_positions"] = np.ascontiguousarray(mesh.positions, np.float32).ravel()
-    values["faces"] = np.ascontiguousarray(mesh.faces, np.uint32).ravel()
+    values["vertex_positions"] = to_device(mi.Float, mesh.positions)
+    values["faces"] = to_device(mi.UInt32, mesh.faces)
     values.update()
     return made
 
@@ -274,8 +275,8 @@ def _hits(
         origin = positions[part, None] + offset * up[..., None] * normals[part, None]
         d = np.broadcast_to(w, origin.shape)
         ray = mi.Ray3f(
-            mi.Point3f(origin.reshape(-1, 3).T.astype(np.float32)),
-            mi.Vector3f(d.reshape(-1, 3).T.astype(np.float32)),
+            to_device(mi.Point3f, origin.reshape(-1, 3).T),
+            to_device(mi.Vector3f, d.reshape(-1, 3).T),
         )
         found = scene.ray_intersect_preliminary(ray)
         which = [np.array(found.is_valid() & (found.shape == mi.ShapePtr(s))) for s in shapes]

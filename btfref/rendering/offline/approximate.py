@@ -83,7 +83,7 @@ def approximate(
     start, camera = time.perf_counter(), description.camera
     reps, prepared, total = {}, {}, np.zeros((camera.height * camera.width, 3))
     wanted = np.full(len(total), True) if pixels is None else np.ravel(pixels)
-    with loaded(scene, parameters, size=size) as made:
+    with loaded(scene, parameters, size=size, sampled=False) as made:
         for surface in surfaces(made, grid):
             for number, (mesh, shape) in enumerate(zip(description.meshes, made.shapes(), strict=True)):
                 hits = Hits.of(surface, mesh.btf, np.flatnonzero(surface.sees(shape) & wanted))

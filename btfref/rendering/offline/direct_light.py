@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from btfref.errors import InputError
+from btfref.numerics.device_arrays import to_device
 from btfref.rendering import RenderResult
 from btfref.scene.camera import film_rays, grid_offsets
 from btfref.scene.lights import distant_or_delta, is_delta
@@ -203,7 +204,11 @@ def regular(
             shifts = rng.integers(2**32, size=(len(STEPS), len(at)), dtype=np.uint32)
             numbers = [
                 mi.Float(
-                    (dr.gather(mi.UInt32, mi.UInt32(shift), index) + (lane - index * n) * increment) >> 8
+                    (
+                        dr.gather(mi.UInt32, to_device(mi.UInt32, shift), index)
+                        + (lane - index * n) * increment
+                    )
+                    >> 8
                 )
                 * 2**-24
                 for shift, increment in zip(shifts, STEPS, strict=True)

@@ -95,7 +95,7 @@ def render_exact(
     height, width = description.camera.height, description.camera.width
     rounds = -(-spp // grid**2)
     sums = np.zeros((batches, 3, height * width))
-    with loaded(scene, parameters, size=size) as made:
+    with loaded(scene, parameters, size=size, sampled=False) as made:
         # Lights at any height: the largest patch that there is, and rays beyond it wrap.
         tiles = TiledScene(mesostructure, np.array([[1.0, 0.0, 1e-6]]))
         together = max(1, min(batches, LANES // (height * width * rounds * grid**2)))

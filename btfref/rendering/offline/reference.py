@@ -91,7 +91,9 @@ def render(
     kept = kept_maps(
         keep, scene, parameters, lights=grid is not None, grid=grid or 4, size=size, margin=margin
     )
-    with loaded(scene, parameters, variant=variant, size=size, kept=kept) as made:
+    # On a grid without random lights there are delta lights alone, and materials are only evaluated.
+    sampled = grid is None or with_variance
+    with loaded(scene, parameters, variant=variant, size=size, kept=kept, sampled=sampled) as made:
         found = traced(made, spp=spp, seed=seed, grid=grid, shadows=shadows, with_variance=with_variance)
     lost = found.meta["not_finite"]
     if lost and (debug or kept):

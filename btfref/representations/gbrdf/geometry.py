@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from btfref.errors import InputError
+from btfref.numerics.device_arrays import to_device
 from btfref.numerics.heightfield import HeightField
 from btfref.numerics.sphere.directions import directions
 
@@ -126,7 +127,7 @@ def _seen_from_above(made: Mesostructure, texels: int) -> SimpleNamespace:
     scene = TiledScene(made, np.array([[0.0, 0.0, 1.0]]))
     index = np.arange(texels * texels)
     x, y = (index % texels + 0.5) / texels, (index // texels + 0.5) / texels
-    origin = mi.Point3f(mi.Float(x), mi.Float(y), 0.125)
+    origin = mi.Point3f(to_device(mi.Float, x), to_device(mi.Float, y), 0.125)
     si = scene.intersect(origin, mi.Vector3f(0, 0, -1))
     hit = np.array(si.is_valid())
     if not hit.all():
@@ -178,9 +179,9 @@ def _flat_btf(bsdf: JitArray, uv: np.ndarray, w: DirectionSet) -> SampledBTF:
     values = np.zeros((k, k, n, 1, 3), np.float32)
     light = np.repeat(w.vectors, n, 0)
     si = dr.zeros(mi.SurfaceInteraction3f, k * n)
-    si.uv = mi.Point2f(np.tile(uv, (k, 1)).T)
+    si.uv, w_light = to_device(mi.Point2f, np.tile(uv, (k, 1)).T), to_device(mi.Vector3f, light.T)
     for view in range(k):
-        si.wi = mi.Vector3f(*(float(c) for c in w.vectors[view]))
-        value = np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(light.T)), np.float32)
+        si.wi = mi.Vector3f(*(dr.opaque(mi.Float, float(c)) for c in w.vectors[view]))  # one kernel for all
+        value = np.array(bsdf.eval(mi.BSDFContext(), si, w_light), np.float32)
         values[view] = value.T.reshape(k, n, 1, 3)
     return SampledBTF(values, w, w)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from btfref.numerics.device_arrays import to_device
 from btfref.sampling.tiled_scene import TiledScene, uniforms
 
 if TYPE_CHECKING:
@@ -181,10 +182,10 @@ class PathEstimator:
         words = [[piece.keys[k] for piece in pieces] for k in (0, 1)]
         # Samples of a lane: base − first lane of the piece + lane + 3 n_lanes times the light.
         table = np.stack([*words, start, lit, base - first, lanes], 1).astype(np.int64) % 2**32
-        self._piece = mi.UInt32(np.repeat(np.arange(len(pieces), dtype=np.uint32), lanes))
-        self._words = mi.UInt32(table.astype(np.uint32).ravel())
-        self._views = mi.Float(np.array([piece.w_view for piece in pieces], np.float32).ravel())
-        self._lights = mi.Float(np.concatenate([piece.lights for piece in pieces]).astype(np.float32).ravel())
+        self._piece = to_device(mi.UInt32, np.repeat(np.arange(len(pieces)), lanes))
+        self._words = to_device(mi.UInt32, table)
+        self._views = to_device(mi.Float, np.array([piece.w_view for piece in pieces]))
+        self._lights = to_device(mi.Float, np.concatenate([piece.lights for piece in pieces]))
 
     def _word(self, lane: JitArray, number: int) -> JitArray:
         import drjit as dr

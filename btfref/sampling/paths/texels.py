@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from btfref.numerics.device_arrays import to_device
 from btfref.sampling.paths import estimator
 from btfref.sampling.paths.estimator import PathEstimator, Piece, strata
 from btfref.sampling.tiled_scene import START, stream_words, uniforms
@@ -190,12 +191,12 @@ class TexelPaths(PathEstimator):
         different, which = np.unique(counts, return_inverse=True)
         split = np.array([strata(int(n)) for n in different], np.uint32)[which]
         self._place = [
-            mi.UInt32(np.repeat(values, counts).astype(np.uint32))
+            to_device(mi.UInt32, np.repeat(values, counts))
             for values in (texel, split[:, 0], split[:, 1], split[:, 2])
         ]
-        self._sample = mi.UInt32(sample.astype(np.uint32))
+        self._sample = to_device(mi.UInt32, sample)
         lane = np.repeat(texel.astype(np.uint64) * stride, counts) + sample.astype(np.uint64)
-        self._lane = mi.UInt32((lane % np.uint64(2**32)).astype(np.uint32))
+        self._lane = to_device(mi.UInt32, lane % np.uint64(2**32))
         self._paths(pieces)
         own = parts[0][0].counts is not None
         found = [self._sums(pieces[0], counts)] if own else self._statistics(pieces)

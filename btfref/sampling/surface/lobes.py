@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from btfref.numerics.device_arrays import to_device
+
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
@@ -73,7 +75,7 @@ class BroadLobes:
         self.any = bool((used > 0).any())
         self.exact = self.masked and exact
         self.drawn = self.rest if self.masked else self.full
-        self._kind, self._table = mi.Float(kind), mi.Float(tables.ravel())
+        self._kind, self._table = to_device(mi.Float, kind), to_device(mi.Float, tables)
         self.table = tables
 
     def _separated(self, bsdf: JitArray) -> tuple[np.ndarray | None, float]:
@@ -88,10 +90,10 @@ class BroadLobes:
             context: JitArray, wi: np.ndarray, wo: np.ndarray, uv: ArrayLike = (0.37, 0.61)
         ) -> np.ndarray:
             si = dr.zeros(mi.SurfaceInteraction3f, len(wi))
-            si.wi, si.uv = mi.Vector3f(wi.T.astype(np.float32)), mi.Point2f(np.asarray(uv, np.float32))
+            si.wi, si.uv = to_device(mi.Vector3f, wi.T), to_device(mi.Point2f, uv)
             si.n = mi.Normal3f(0, 0, 1)
             si.sh_frame = mi.Frame3f(si.n)
-            return np.array(bsdf.eval(context, si, mi.Vector3f(wo.T.astype(np.float32)))).T
+            return np.array(bsdf.eval(context, si, to_device(mi.Vector3f, wo.T))).T
 
         rng = np.random.default_rng(0)
         wi, wo = (np.abs(rng.normal(size=(512, 3))) for _ in range(2))

@@ -172,18 +172,10 @@ def test_pictures_equal_float64(under_sky, fits, tables, monkeypatch, key):
     assert found.passed, [gate.line for gate in found.gates]
 
 
-#: What the approximation costs a picture.
-LOOSE = [
-    "rf_lobes",
-    pytest.param("rf_poly", marks=pytest.mark.long),
-    pytest.param("lafortune", marks=pytest.mark.long),
-    pytest.param("lafortune_lut", marks=pytest.mark.long),
-]
-
-
-@pytest.mark.parametrize("key", LOOSE)
+@pytest.mark.long
+@pytest.mark.parametrize("key", KEYS)
 def test_pictures_are_near_the_path_tracer(under_sky, key):
-    """The approximation's own error; the reference's noise must not decide."""
+    """The approximation's own error; the reference's noise must not decide. By default: test_environment_images."""
     parameters = under_sky(key)
     image = realtime(read_scene(SPHERE, parameters, size=SIZE), grid=4)
     classes = pixel_classes(SPHERE, parameters=parameters, grid=4, size=SIZE)

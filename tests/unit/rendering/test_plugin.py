@@ -9,6 +9,7 @@ from probes import hemisphere, probe_points
 
 from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
+from btfref.numerics.device_arrays import to_device
 from btfref.registry import method, methods
 from btfref.representations import load, save
 from btfref.stress.evaluators import surface
@@ -17,14 +18,16 @@ from btfref.stress.evaluators import surface
 def value(mi, plugin, uv, w_light, w_view, mode=None):
     context = mi.BSDFContext() if mode is None else mi.BSDFContext(mode)
     si = surface(mi, len(uv), np.asarray(uv).T, np.asarray(w_view).T)
-    return np.array(plugin.eval(context, si, mi.Vector3f(np.asarray(w_light).T))).T
+    return np.array(plugin.eval(context, si, to_device(mi.Vector3f, np.asarray(w_light).T))).T
 
 
-def test_registers_again_after_a_variant_change(fits, llvm, load_plugin):
-    first = load_plugin(fits.path("lpca"))
+def test_registers_again_after_a_variant_change(fits, llvm):
+    import mitsuba_plugins
+
+    first = mitsuba_plugins.load(fits.path("lpca"))
     # A variant that cannot take the plugin gives way to one that can.
     llvm.set_variant("scalar_rgb")
-    second = load_plugin(fits.path("lpca"))
+    second = mitsuba_plugins.load(fits.path("lpca"))
     assert llvm.variant() == "llvm_ad_rgb"
     assert str(first) == str(second)
     assert "method=lpca" in str(second)
@@ -105,9 +108,11 @@ def test_twosided_mirrors(fits, llvm, load_plugin, rng):
 
 
 @pytest.mark.parametrize("key", methods())
-def test_maps_are_differentiable(key, llvm, load_plugin, rng, tmp_path):
+def test_maps_are_differentiable(key, llvm, rng, tmp_path):
     """The gradient of the mean value with respect to a map equals the difference quotient along a random direction."""
     import drjit as dr
+
+    import mitsuba_plugins
 
     mi = llvm
     # Maps of floats: halves would round both ends of the difference.
@@ -115,7 +120,7 @@ def test_maps_are_differentiable(key, llvm, load_plugin, rng, tmp_path):
     storage = {"storage": "float"} if "storage" in inspect.signature(fit).parameters else {}
     path = tmp_path / f"oracle.{key}.exr"
     save(fit(oracle_btf((8, 6)), **storage), path)
-    plugin = load_plugin(path)
+    plugin = mitsuba_plugins.load(path)
     parameters = mi.traverse(plugin)
     # The largest differentiable map.
     name = max(
@@ -123,7 +128,7 @@ def test_maps_are_differentiable(key, llvm, load_plugin, rng, tmp_path):
         key=lambda n: len(parameters[n].array),
     )
     uv, w_light, w_view = rng.random((256, 2)), hemisphere(rng, 256), hemisphere(rng, 256)
-    si, wo = surface(mi, len(uv), uv.T, w_view.T), mi.Vector3f(w_light.T)
+    si, wo = surface(mi, len(uv), uv.T, w_view.T), to_device(mi.Vector3f, w_light.T)
     start = mi.TensorXf(parameters[name])
     # Of one sign, so that contributions do not cancel.
     step = mi.TensorXf(rng.random(start.shape).astype(np.float32))

@@ -26,7 +26,7 @@ def btf(fits):
 @pytest.fixture(scope="module")
 def small():
     """A table that the definition can be asked for whole."""
-    return oracle_btf((8, 6))
+    return oracle_btf((6, 4))
 
 
 @pytest.fixture(params=methods())
