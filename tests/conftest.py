@@ -128,10 +128,6 @@ def llvm(need):
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    if ONE_CORE:
-        import drjit as dr
-
-        dr.set_thread_count(1)
     yield mi
     _free()
 

@@ -189,7 +189,7 @@ def _pool(workers: int) -> _Here | ProcessPoolExecutor:
 
 
 def _start_worker() -> None:
-    """One core a process: their threads would only wait for each other."""
+    """About one core a process: their threads would only wait for each other."""
     os.environ["LP_NUM_THREADS"] = "1"
     from threadpoolctl import threadpool_limits
 
@@ -203,7 +203,8 @@ def _start_worker() -> None:
         return  # the jobs say so
     import drjit as dr
 
-    dr.set_thread_count(1)
+    # With a single thread Mitsuba waits forever for an OpenEXR file (the sky of a scene of the user's).
+    dr.set_thread_count(2)
 
 
 def _each(pool: _Here | ProcessPoolExecutor, jobs: Sequence[_Job]) -> Iterator[tuple[Any, bool]]:
