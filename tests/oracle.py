@@ -33,8 +33,8 @@ KINDS = {
     "scattered": (scattered(seed=3), scattered(seed=4)),
 }
 
-#: Texels of the tables that all registered methods are fitted to.
-SHAPE = (16, 12)
+#: Texels of the tables that all registered methods are fitted to: on rings; on other sets, which texels do not know of.
+SHAPE, FEW = (16, 12), (8, 6)
 
 
 class Fits:
@@ -52,7 +52,7 @@ class Fits:
     def btf(self, kind="ubo81"):
         """The table; see KINDS."""
         if kind not in self._btfs:
-            self._btfs[kind] = oracle_btf(SHAPE, *KINDS[kind])
+            self._btfs[kind] = oracle_btf(SHAPE if kind == "ubo81" else FEW, *KINDS[kind])
         return self._btfs[kind]
 
     def __call__(self, key, kind="ubo81"):

@@ -46,7 +46,7 @@ def test_hard_lookups(key, fits, llvm, need):
     assert_all_pass(runner.stress_lookups(fits(key, "scattered"), "formula, scattered", ("glsl",), n=2048))
 
 
-@pytest.mark.parametrize("key", ["lpca", "rf_poly"])
+@pytest.mark.parametrize("key", ["svd", "rf_poly"])
 def test_hard_data(key, need):
     need("gl")
     need("llvm")
