@@ -110,18 +110,18 @@ def _headers(path: Path) -> list[Facts] | None:
     """Headers of an OpenEXR file, or None when it cannot be read as one."""
     if not path.is_file() or path.stat().st_size == 0:
         return None
-    import OpenEXR
+    from btfref.images.openexr import opened
 
     try:
-        with OpenEXR.File(str(path), header_only=True) as file:
+        with opened(path, header_only=True) as file:
             return [dict(part.header) for part in file.parts]  # closing the file empties them
-    except RuntimeError:
+    except (RuntimeError, OSError):
         return None
 
 
 def _plain_exr(path: Path) -> bool:
     """Whether this is an OpenEXR image rather than a representation; broken files count as the latter."""
-    from btfref.representations.file.container import ATTRIBUTE
+    from btfref.representations.file.manifest import ATTRIBUTE
 
     headers = _headers(path)
     return headers is not None and ATTRIBUTE not in headers[0]

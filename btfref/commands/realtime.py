@@ -26,6 +26,7 @@ from btfref.commands.shared.options import (
 from btfref.commands.shared.printing import emit, emit_json
 from btfref.commands.shared.reading import assignments, count, output_file
 from btfref.errors import InputError
+from btfref.limits import DIRECTIONS
 from btfref.rendering.environment_light import PATHS
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument(
         "--lights",
-        type=count(1),
+        type=count(1, DIRECTIONS),
         metavar="N",
         help="that stand for it (default: for an estimated error of 1 %%)",
     )

@@ -31,6 +31,7 @@ from btfref.commands.shared.reading import (
     ranges,
 )
 from btfref.errors import InputError
+from btfref.limits import SAMPLES, WORKERS
 from btfref.sampling.settings import ESTIMATORS, MOST_SAMPLES, SAMPLES, SynthesisSettings
 from btfref.types import Facts
 
@@ -62,7 +63,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--lights", default=default.lights, metavar="SET", help="likewise")
     parser.add_argument(
         "--spp",
-        type=count(2),
+        type=count(2, SAMPLES),
         default=default.spp,
         metavar="N",
         help=f"paths (or surface points) per texel and view (default {SAMPLES}); with --target-error the most "
@@ -150,7 +151,10 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="workers of a local Dask cluster, or of the one at tcp://HOST:PORT, whose workers see the same files",
     )
     parser.add_argument(
-        "--workers", type=count(1), metavar="N", help="of the local cluster (default: one per two processors)"
+        "--workers",
+        type=count(1, WORKERS),
+        metavar="N",
+        help="of the local cluster (default: one per two processors)",
     )
     parser.add_argument(
         "--variant", default=default.variant, help="of Mitsuba (default %(default)s; cuda_ad_rgb)"

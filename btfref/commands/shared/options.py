@@ -6,6 +6,7 @@ import textwrap
 from argparse import ArgumentParser, _ActionsContainer
 
 from btfref.commands.shared.reading import count, size
+from btfref.limits import GRID, SEED
 from btfref.sampling.settings import DTYPES
 from btfref.scene.shipped import ENVIRONMENTS, described, lights, names
 
@@ -40,7 +41,7 @@ def add_grid(
     parser: _ActionsContainer, *, default: int | None = 4, text: str = "N × N sub-pixels (default 4)"
 ) -> None:
     """``--grid N``: the regular grid of samples in each pixel."""
-    parser.add_argument("--grid", type=count(1), default=default, metavar="N", help=text)
+    parser.add_argument("--grid", type=count(1, GRID), default=default, metavar="N", help=text)
 
 
 def add_keep(parser: _ActionsContainer) -> None:
@@ -66,7 +67,7 @@ def words(text: str | None) -> list[str] | None:
 def add_seed(parser: _ActionsContainer) -> None:
     """``--seed N``."""
     parser.add_argument(
-        "--seed", type=count(0), default=0, metavar="N", help="of all random numbers (default 0)"
+        "--seed", type=count(0, SEED), default=0, metavar="N", help="of all random numbers (default 0)"
     )
 
 
