@@ -1,9 +1,9 @@
 """Well-formed files with wrong contents: what a validator must refuse before an evaluator sees it.
 
 A case takes a small representation of one method, changes one number of its facts, one of its tables or one of its
-shapes to something hostile, saves it through `btfref.save` and, where it is taken, evaluates it everywhere. Cases run in
-child processes, since what they look for ends a process: ``python tests/contents.py contents|bytes FOLDER SEED FIRST
-LAST``, where "bytes" changes bytes of good files instead.
+shapes to something hostile, saves it through `btfref.save` and, where it is taken, evaluates it everywhere. Cases run
+in child processes, since what they look for ends a process: ``python tests/contents.py contents|bytes FOLDER SEED
+FIRST LAST``, where "bytes" changes bytes of good files instead.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import pickle
 import select
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -200,7 +199,9 @@ def with_hostile_shape(arrays, meta, rng):
     else:
         other = np.ascontiguousarray(np.moveaxis(array, axis, 0))
     # A codebook may have an entry that nobody names; tables of direction pairs may be square.
-    free = other.shape == array.shape or (axis == 0 and name.startswith("factor_") and len(other) > len(array))
+    free = other.shape == array.shape or (
+        axis == 0 and name.startswith("factor_") and len(other) > len(array)
+    )
     return {**rest, name: other}, meta, f"{name} {array.shape} as {other.shape}", free
 
 
@@ -331,7 +332,6 @@ def children(folder, seed, cases, *, mode="contents", each=1000):
         command = [sys.executable, __file__, mode, str(folder), str(seed), str(first), str(last)]
         at, what = first - 1, "before its first case"
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
-            started = time.monotonic()
             while True:
                 if not select.select([child.stdout], [], [], LONGEST)[0]:
                     child.kill()
@@ -348,7 +348,6 @@ def children(folder, seed, cases, *, mode="contents", each=1000):
                 if word["verdict"] not in ("refused", "taken", "not saved"):
                     failures.append(f"case {at}: {word['verdict']}: {what}")
             _, said = child.communicate()
-            counts["seconds"] = counts.get("seconds", 0) + time.monotonic() - started
         if child.returncode:
             failures.append(f"case {at}: status {child.returncode}: {what} {said[-300:]}")
             first = at + 1

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from btfref.commands.shared.options import add_json
+from btfref.commands.shared.options import add_json, add_overwrite
 from btfref.commands.shared.printing import bytes_text, emit, emit_json
 from btfref.commands.shared.reading import output_file, ranges
 from btfref.errors import InputError
@@ -24,6 +24,9 @@ _BYTES = (
     *("float_bytes", "half_bytes", "code_bytes", "published_bytes"),
 )
 
+#: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
+OUTPUTS = {"plot": "picture"}
+
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
@@ -31,6 +34,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "file", metavar="FILE", help="representation (.exr), sampled BTF (.btf.zarr), measured BTF, or image"
     )
     add_json(parser, "the facts")
+    add_overwrite(parser)
     parser.add_argument("--plot", metavar="OUT.png", help="draw a sampled BTF")
     parser.add_argument(
         "--texel",

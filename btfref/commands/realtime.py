@@ -32,6 +32,9 @@ from btfref.rendering.environment_light import PATHS
 if TYPE_CHECKING:
     from btfref.rendering.environment_light.transfer import TransferSettings
 
+#: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
+OUTPUTS = {"output": "picture"}
+
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""

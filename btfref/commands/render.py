@@ -25,6 +25,9 @@ from btfref.commands.shared.reading import assignments, count, output_file
 from btfref.errors import InputError
 from btfref.limits import SAMPLES
 
+#: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
+OUTPUTS = {"output": "picture", "classes": "picture"}
+
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""

@@ -31,12 +31,16 @@ from btfref.commands.shared.reading import (
     ranges,
 )
 from btfref.errors import InputError
-from btfref.limits import SAMPLES, WORKERS
+from btfref.limits import SAMPLES as MANY_SAMPLES
+from btfref.limits import WORKERS
 from btfref.sampling.settings import ESTIMATORS, MOST_SAMPLES, SAMPLES, SynthesisSettings
 from btfref.types import Facts
 
 #: Options that are parameters of a user's mesh or height map.
 _OWN = ("bsdf", "albedo", "roughness", "amplitude", "tile", "up", "allow_seams")
+
+#: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
+OUTPUTS = {"output": "store"}
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -63,7 +67,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--lights", default=default.lights, metavar="SET", help="likewise")
     parser.add_argument(
         "--spp",
-        type=count(2, SAMPLES),
+        type=count(2, MANY_SAMPLES),
         default=default.spp,
         metavar="N",
         help=f"paths (or surface points) per texel and view (default {SAMPLES}); with --target-error the most "

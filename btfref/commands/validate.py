@@ -20,6 +20,9 @@ from btfref.limits import WORKERS
 if TYPE_CHECKING:
     from btfref.validate.run import Validation
 
+#: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
+OUTPUTS = {"output": "folder"}
+
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""

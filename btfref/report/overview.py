@@ -58,7 +58,7 @@ def overview(cells: Sequence[Cell]) -> str:
     names = {key: escape(key).replace(".", ".<wbr>") for key in groups}
     top = "".join(
         f'<th scope="colgroup" colspan="{len(members)}"><code>{names[key]}</code>'
-        f"<small>{members[0].pixel_class}</small></th>"
+        f"<small>{escape(members[0].pixel_class or '')}</small></th>"
         for key, members in groups.items()
     )
     columns = [gate for members in groups.values() for gate in members]

@@ -29,7 +29,15 @@ def add_image(parser: _ActionsContainer) -> None:
     """Where an image goes, and how large it is."""
     parser.add_argument("-o", "--output", required=True, metavar="X.exr", help="the image to write")
     parser.add_argument("--png", action="store_true", help="also write X.png, for eyes")
+    add_overwrite(parser)
     add_size(parser)
+
+
+def add_overwrite(parser: _ActionsContainer) -> None:
+    """``--overwrite``: an output may take the place of a file of another kind."""
+    parser.add_argument(
+        "--overwrite", action="store_true", help="replace a file of another kind that has the output's name"
+    )
 
 
 def add_size(parser: _ActionsContainer, text: str = "of the image, in pixels (default: the scene's)") -> None:

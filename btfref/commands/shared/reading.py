@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from argparse import ArgumentTypeError
 from collections.abc import Callable, Iterable
@@ -132,6 +133,8 @@ def direction_set(text: str) -> str | np.ndarray:
     """
     if not text.endswith((".txt", ".csv")):
         return text
+    if Path(text).exists() and not Path(text).is_file():
+        raise InputError("cannot read directions", file=text, got="no file", expected="theta phi per line")
     import numpy as np
 
     try:
@@ -164,4 +167,6 @@ def output_file(text: PathLike, *suffixes: str) -> Path:
         )
     if not path.parent.is_dir():
         raise InputError("cannot write there", file=text, got="no such folder")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise InputError("cannot write there", file=text, got="a place that is read-only for you")
     return path

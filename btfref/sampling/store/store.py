@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 from collections.abc import Callable, Sequence
@@ -25,6 +26,19 @@ if TYPE_CHECKING:
     from btfref.types import Facts, PathLike
 
 _T = TypeVar("_T")
+
+#: Errors of a place and not of what stands there: full, too large, read-only, not permitted, too many files.
+OF_THE_SYSTEM = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EMFILE,
+    errno.ENFILE,
+    errno.ENOMEM,
+)
 
 
 def create_store(
@@ -154,11 +168,17 @@ class BTFStore:
         return in_one_line(kind, self.texels, self.views.facts, self.lights.facts, size)
 
     def _guard(self, field: str, action: Callable[[], _T]) -> _T:
-        """Whatever Zarr makes of a damaged file becomes one clear line."""
+        """Whatever Zarr makes of a damaged file becomes one clear line; a full disk is no damage."""
         try:
             return action()
         except InputError:
             raise
+        except MemoryError:
+            raise
+        except OSError as error:
+            if error.errno in OF_THE_SYSTEM:
+                raise OSError(error.errno, os.strerror(error.errno), str(self.path)) from error
+            raise InputError("damaged store", file=self.path, field=field, got=error) from error
         except Exception as error:
             raise InputError("damaged store", file=self.path, field=field, got=error) from error
 
