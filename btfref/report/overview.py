@@ -86,7 +86,7 @@ def _row(index: int, cell: Cell, columns: Sequence[str]) -> str:
             continue
         title = escape(f"{gate.sign} {number(gate.limit)}. {gate.detail}")
         sign = {"fail": " ✗", "inconclusive": " ?"}.get(gate.outcome, "")
-        values.append(f'<td class="{gate.outcome}" title="{title}">{number(gate.value)}{sign}</td>')
+        values.append(f'<td class="{gate.outcome}" title="{title}">{escape(number(gate.value))}{sign}</td>')
     measured = (cell.comparison.metrics if cell.comparison else {}).get(PixelClass.INTERIOR.label, {})
     values += [f"<td>{number(measured.get(key))}</td>" for key in SHOWN.values()]
     link = f'<a href="#cell-{index}">{_thumbnails(cell)}<span>{escape(cell.name)}</span></a>'

@@ -24,8 +24,8 @@ from btfref.sampling.store.selection import Selection
 if TYPE_CHECKING:
     from btfref.types import Facts, PathLike
 
-#: Key of an array.
-_ARRAY = "array"
+#: Key of an array; no key of a BSDF, whose textures are called "array".
+_ARRAY = "__array__"
 
 
 def write_job(path: PathLike, job: Job, only: Selection | None, plan: Plan | None) -> None:

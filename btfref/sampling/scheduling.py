@@ -170,6 +170,7 @@ def _distribute(
     """Hand the views out; what a lost worker had not finished goes to another."""
     import distributed
 
+    _refuse_other_versions(client)
     count = max(1, len(client.nthreads()))
     if job.settings.estimator == "surface":
         # Points and their walks serve all views of a task: as few tasks as there are workers.
@@ -220,6 +221,30 @@ def _distribute(
         return largest
     finally:
         order.unlink(missing_ok=True)
+
+
+def _refuse_other_versions(client: distributed.Client) -> None:
+    """InputError for a worker of another btfref; those that join later are told by the job's file."""
+    from btfref.provenance import __version__
+
+    try:
+        found = client.run(_version)
+    except (AttributeError, ImportError, ModuleNotFoundError) as error:
+        raise InputError(
+            "a worker of another version", field="btfref", got=f"{error}", expected=__version__
+        ) from None
+    for worker, version in found.items():
+        if version != __version__:
+            raise InputError(
+                f"a worker of another version ({worker})", field="btfref", got=version, expected=__version__
+            )
+
+
+def _version() -> str:
+    """Version of the worker's btfref."""
+    from btfref.provenance import __version__
+
+    return __version__
 
 
 def _work(order: str, path: str, views: list[int], stage: str, settings: _Means) -> tuple[int, int]:

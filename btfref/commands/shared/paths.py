@@ -29,7 +29,7 @@ KINDS = {
 _NEITHER = ("cache", "folders", "run")
 
 #: References of a scene file to other files.
-_FILENAMES = re.compile(rb"""<string\s[^>]*?value\s*=\s*["']([^"'$]+)["']""")
+_FILENAMES = re.compile(rb"""\bvalue\s*=\s*["']([^"'$]{1,1000})["']""")
 
 #: Bytes of a scene file that are searched.
 _MOST = 1 << 22
@@ -60,11 +60,11 @@ def check_paths(args: Namespace, outputs: Mapping[str, str]) -> None:
         _refuse_other(Path(text), option, wanted, overwrite=getattr(args, "overwrite", False))
         if name == "output" and getattr(args, "png", False):
             _refuse_input(Path(text).with_suffix(".png"), "--png", inputs)
-    paths = [os.path.realpath(text) for text in written.values()]
-    if len(set(paths)) < len(paths):
-        raise InputError(
-            "two outputs have one name", field=", ".join(written), got=", ".join(written.values())
-        )
+    names = list(written.values())
+    if getattr(args, "png", False) and "output" in written:
+        names.append(str(Path(written["output"]).with_suffix(".png")))
+    if len({os.path.realpath(name) for name in names}) < len(names):
+        raise InputError("two outputs have one name", field="-o", got=", ".join(names))
 
 
 def _inputs(args: Namespace, written: Collection[str]) -> Iterator[Path]:
