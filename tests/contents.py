@@ -84,7 +84,7 @@ SETTINGS = {
         "storage": "byte",
     },
     "hf": {"map_size": 6, "clusters": 3},
-    "gbrdf": {"ndf_size": 6},
+    "gbrdf": {"ndf_size": 8},
     "rf_lobes": {"lobes": 1},
     "lafortune": {"lobes": 1},
     "lafortune_lut": {"lobes": 1},
