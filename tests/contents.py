@@ -229,12 +229,12 @@ class Everywhere:
 
     def __call__(self, path):
         from btfref.representations import load
-        from btfref.stress.evaluators import evaluator
+        from btfref.stress.evaluators import DEFINITION, PORTS, evaluator
 
         loaded = load(path)
         return {
             name: np.asarray(evaluator(name, loaded, path).evaluate(*self.points))
-            for name in ("definition", "drjit", "glsl")
+            for name in (DEFINITION, *PORTS)
         }
 
 

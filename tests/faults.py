@@ -210,7 +210,7 @@ ROWS = [
             "export good.exr -o new --format maps",
         )
         if not (command.startswith("info") and fault in ("view_cells=1e9", "view_triangles=1e9", "NaN"))
-        and not (command.startswith("demand") and fault == "NaN")
+        and (command.startswith(("info", "render")) or fault in ("texels=[1000, 1000]", "view_cells=1e9"))
     ),
     # 3
     *(
@@ -222,13 +222,20 @@ ROWS = [
             ("texels=[-1, 2]", "texels", setting("texels", value=[-1, 2])),
             ("lights.count=true", "lights.count", setting("lights", "count", value=True)),
             ("a list of versions", "versions", setting("versions", value=[])),
-            ("another method", "svd", setting("method", value="svd")),
+            ("another method", "values", setting("method", value="svd")),
             ("no such method", "nonsense", setting("method", value="nonsense")),
         )
     ),
     # 4
     Row("place", "no LLVM", RENDER, ("LLVM",), prepare=no_llvm),
     Row("place", "no LLVM", "synth flat -o new.btf.zarr --texels 2 --spp 2", ("LLVM",), prepare=no_llvm),
+    Row(
+        "place",
+        "no CUDA",
+        f"{RENDER} --variant cuda_ad_rgb",
+        ("CUDA",),
+        prepare=failing("mitsuba.set_variant", ImportError("no CUDA")),
+    ),
     Row(
         "place",
         "no OpenGL",

@@ -119,7 +119,7 @@ def _headers(path: Path) -> list[Facts] | None:
     try:
         with opened(path, header_only=True) as file:
             return [dict(part.header) for part in file.parts]  # closing the file empties them
-    except (RuntimeError, OSError):
+    except (RuntimeError, ValueError, OSError):
         return None
 
 

@@ -18,6 +18,7 @@ from btfref.errors import InputError
 from btfref.limits import refuse_large_picture
 from btfref.numerics.footprint import MODES
 from btfref.numerics.sphere.frames import uv_transform
+from btfref.platform import set_variant
 from btfref.representations.file.container import refuse_store
 from btfref.scene.parameters import check_parameters
 from btfref.scene.shapes import BtfMaterial
@@ -112,7 +113,7 @@ def use_variant(name: str) -> None:
     if name not in mi.variants():
         raise InputError("unknown Mitsuba variant", got=name, expected=", ".join(mi.variants()))
     if mi.variant() != name:
-        mi.set_variant(name)
+        set_variant(name)
 
 
 def scalar_types() -> ModuleType:

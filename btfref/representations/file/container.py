@@ -386,7 +386,9 @@ def _whole_file(path: PathLike, manifest: Facts) -> dict[str, np.ndarray]:
                 name: _read_map(path, name, entry, _channels_of(path, name, entry, parts[name]), manifest)
                 for name, entry in manifest["arrays"].items()
             }
-    except (RuntimeError, OSError, KeyError, IndexError) as error:
+    except InputError:
+        raise
+    except (RuntimeError, ValueError, TypeError, OSError, KeyError, IndexError) as error:
         raise InputError(f"damaged or truncated OpenEXR file: {error}", file=path) from error
 
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.sphere.directions import spherical
-from btfref.numerics.sphere.interpolation import MISSING, TRIANGLE_FLOATS
+from btfref.numerics.sphere.interpolation import MISSING, TRIANGLE_FLOATS, barycentric
+from btfref.numerics.sphere.parabolic import square_to_hemisphere
 from btfref.representations.file.schema import (
     FLOATS,
     INDICES,
@@ -304,6 +305,7 @@ def _check_directions(check: _Check, kind: str, arrays: Mapping[str, np.ndarray]
         if (cells != np.floor(cells)).any() or cells.min() < 0 or cells.max() >= n:
             got = f"{cells.min():g} … {cells.max():g}"
             check.refuse(f"{kind}_cells", got, f"0 … {n - 1}", "a table of directions is damaged")
+        _check_cells(check, f"{kind}_cells", cells.astype(int), arrays[f"{kind}_triangles"].astype(float))
 
 
 def _check_rings(check: _Check, name: str, rings: np.ndarray, vectors: np.ndarray) -> None:
@@ -313,7 +315,7 @@ def _check_rings(check: _Check, name: str, rings: np.ndarray, vectors: np.ndarra
         check.refuse(name, counts.tolist(), f"counts of {len(vectors)} directions", damaged)
     if counts[0] != 1 or (starts != np.cumsum([0, *counts[:-1]])).any():
         check.refuse(name, starts.tolist(), "the pole first, then ring after ring", damaged)
-    if theta[0] != 0 or (np.diff(theta) <= 0).any() or (np.abs(phi) > 7).any():
+    if theta[0] != 0 or phi[0] != 0 or (np.diff(theta) <= 0).any() or (np.abs(phi) > 7).any():
         check.refuse(name, theta.tolist(), "polar angles from 0 on, rising", damaged)
     ring = np.repeat(np.arange(len(rings)), counts.astype(int))
     turn = (np.arange(len(vectors)) - starts[ring]) / counts[ring]
@@ -321,6 +323,20 @@ def _check_rings(check: _Check, name: str, rings: np.ndarray, vectors: np.ndarra
     if np.nanmax(off, initial=0) > DIRECTION_TOLERANCE:
         at = int(np.nanargmax(off.max(1)))
         check.refuse(name, f"direction {at} elsewhere", "rings of the directions", damaged)
+
+
+def _check_cells(check: _Check, name: str, cells: np.ndarray, table: np.ndarray) -> None:
+    """Each cell names the triangle that holds its centre."""
+    centre = (np.arange(len(cells)) + 0.5) / len(cells) * 2 - 1
+    w = square_to_hemisphere(np.stack(np.meshgrid(centre, centre), -1))
+    row = table[cells]
+    size = np.abs(row[..., 6:15]).max(-1)
+    outside = barycentric(row, w).min(-1) < -DUAL_TOLERANCE * np.maximum(size, 1)
+    if outside.any():
+        at = np.argwhere(outside)[0].tolist()
+        check.refuse(
+            name, f"cell {at} elsewhere", "the triangle of its centre", "a table of directions is damaged"
+        )
 
 
 def _check_triangles(check: _Check, name: str, table: np.ndarray, vectors: np.ndarray) -> None:
