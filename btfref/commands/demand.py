@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING
 from btfref.commands.shared.options import add_define, add_grid, add_json, add_size, help_with_scenes
 from btfref.commands.shared.printing import Progress, emit, emit_json, table
 from btfref.commands.shared.reading import assignments, count, direction_set, number_above
-from btfref.errors import InputError
-from btfref.limits import TEXELS
+from btfref.errors import TEXELS, InputError
 
 if TYPE_CHECKING:
     from btfref.numerics.sphere.directions import DirectionSet

@@ -25,8 +25,7 @@ from btfref.commands.shared.options import (
 )
 from btfref.commands.shared.printing import emit, emit_json
 from btfref.commands.shared.reading import assignments, count, output_file
-from btfref.errors import InputError
-from btfref.limits import DIRECTIONS
+from btfref.errors import DIRECTIONS, InputError
 from btfref.rendering.environment_light import PATHS
 
 if TYPE_CHECKING:

@@ -22,8 +22,7 @@ from btfref.commands.shared.options import (
 )
 from btfref.commands.shared.printing import emit
 from btfref.commands.shared.reading import assignments, count, output_file
-from btfref.errors import InputError
-from btfref.limits import SAMPLES
+from btfref.errors import SAMPLES, InputError
 
 #: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
 OUTPUTS = {"output": "picture", "classes": "picture"}

@@ -30,9 +30,8 @@ from btfref.commands.shared.reading import (
     output_file,
     ranges,
 )
-from btfref.errors import InputError
-from btfref.limits import SAMPLES as MANY_SAMPLES
-from btfref.limits import WORKERS
+from btfref.errors import SAMPLES as MANY_SAMPLES
+from btfref.errors import WORKERS, InputError
 from btfref.sampling.settings import ESTIMATORS, MOST_SAMPLES, SAMPLES, SynthesisSettings
 from btfref.types import Facts
 

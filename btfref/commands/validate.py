@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from btfref.commands.shared.options import add_json, add_only, words
 from btfref.commands.shared.printing import Progress, emit, emit_json, number, table
 from btfref.commands.shared.reading import count
-from btfref.limits import WORKERS
+from btfref.errors import WORKERS
 
 if TYPE_CHECKING:
     from btfref.validate.run import Validation

@@ -169,6 +169,7 @@ def _distribute(
 ) -> int:
     """Hand the views out; what a lost worker had not finished goes to another."""
     import distributed
+    from distributed.comm.core import CommClosedError
 
     _refuse_other_versions(client)
     count = max(1, len(client.nthreads()))
@@ -208,7 +209,7 @@ def _distribute(
                 file=store.path,
                 got=str(error).partition("\n")[0],
             ) from None
-        except (distributed.CancelledError, distributed.CommClosedError, TimeoutError) as error:
+        except (distributed.CancelledError, CommClosedError, TimeoutError) as error:
             raise InputError(
                 "the scheduler is gone; start the same command again to go on",
                 file=store.path,

@@ -14,8 +14,7 @@ from types import ModuleType
 
 import numpy as np
 
-from btfref.errors import InputError
-from btfref.limits import refuse_large_picture
+from btfref.errors import InputError, refuse_large_picture
 from btfref.numerics.footprint import MODES
 from btfref.numerics.sphere.frames import uv_transform
 from btfref.platform import set_variant

@@ -32,7 +32,6 @@ btfref.doctor
 btfref.system btfref.provenance
 btfref.registry btfref.platform btfref.outputs
 btfref.conventions
-btfref.limits
 btfref.errors btfref.precision
 btfref.types
 """.split("\n")[1:-1]

@@ -6,7 +6,7 @@ import textwrap
 from argparse import ArgumentParser, _ActionsContainer
 
 from btfref.commands.shared.reading import count, size
-from btfref.limits import GRID, SEED
+from btfref.errors import GRID, SEED
 from btfref.sampling.settings import DTYPES
 from btfref.scene.shipped import ENVIRONMENTS, described, lights, names
 

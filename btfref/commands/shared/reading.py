@@ -10,8 +10,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from btfref.errors import InputError
-from btfref.limits import COUNT, INDICES, PIXELS, Limit
+from btfref.errors import COUNT, INDICES, PIXELS, InputError, Limit
 from btfref.types import PathLike
 
 if TYPE_CHECKING:

@@ -10,8 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from btfref.errors import InputError
-from btfref.limits import DIRECTIONS, refuse_above
+from btfref.errors import DIRECTIONS, InputError, refuse_above
 from btfref.numerics.sphere import interpolation
 from btfref.numerics.sphere.quadrature import hemisphere_weights
 from btfref.types import PathLike

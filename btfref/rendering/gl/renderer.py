@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from btfref import representations
-from btfref.errors import BtfrefError, InputError
-from btfref.limits import GRID, refuse_above
+from btfref.errors import GRID, BtfrefError, InputError, refuse_above
 from btfref.rendering import RenderResult
 from btfref.rendering.environment_light.lighting import lighting_of
 from btfref.rendering.gl import device

@@ -8,8 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from btfref.errors import BtfrefError, InputError
-from btfref.limits import GRID, SAMPLES, refuse_above
+from btfref.errors import GRID, SAMPLES, BtfrefError, InputError, refuse_above
 from btfref.rendering import RenderResult
 from btfref.rendering.offline.direct_light import make_integrator, on_grid
 from btfref.sampling.variant import no_collection

@@ -85,7 +85,9 @@ class _Fields:
         value = self.take(name, "a list of whole numbers")
         good = isinstance(value, list) and len(value) in counts
         if not good or not all(_is_whole(n, least, most) for n in value):
-            expected = f"{counts.start} to {counts.stop - 1} whole numbers in [{least}, {most}]"
+            least_count, most_count = counts.start, counts.stop - 1
+            number = f"{least_count}" if least_count == most_count else f"{least_count} to {most_count}"
+            expected = f"{number} whole numbers in [{least}, {most}]"
             self.refuse(name, value, expected)
         return value
 

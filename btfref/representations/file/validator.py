@@ -82,7 +82,7 @@ def check_layout(manifest: Facts, kind: object, path: PathLike) -> None:
     types = {name: entry["dtype"] for name, entry in manifest["arrays"].items()}
     rows, columns = meta["texels"]
     numbers = {"rows": rows, "columns": columns}
-    direction_maps = set()
+    direction_maps: set[str] = set()
     for one in _KINDS:
         numbers[f"{one}s"] = _directions(check, one, meta, shapes, types, direction_maps)
     for name, shape in shapes.items():
@@ -177,7 +177,10 @@ def _constants(check: _Check, schema: Schema, meta: Facts, numbers: Mapping[str,
         field = f"meta.constants.{name}"
         if name not in schema.constants:
             check.refuse(
-                field, value, f"one of {', '.join(schema.constants)}", "a constant that the method has not"
+                field,
+                value,
+                f"one of {', '.join(schema.constants) or 'none'}",
+                "a constant that the method has not",
             )
         wanted = schema.constants[name]
         if isinstance(wanted, OneOf):
