@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -370,20 +369,40 @@ def _all_methods() -> tuple[dict[str, Method], dict[str, BrokenPoint]]:
     return rows, broken
 
 
-def representations() -> dict[str, type[Any]]:
-    """Classes of representations by method, of those whose module can be loaded."""
+def usable_methods() -> dict[str, Method]:
+    """Methods by key, those of other packages only where their modules can be loaded too: what "all methods" means."""
+    return {key: row for key, row in methods().items() if key not in _unloadable()}
+
+
+@cache
+def _unloadable() -> dict[str, str]:
+    """Methods of other packages whose modules cannot be loaded, and why."""
+    own = {row.key for row in _ROWS}
     found = {}
     for key, row in methods().items():
-        with suppress(BtfrefError):
-            found[key] = row.representation
+        if key not in own:
+            try:
+                _ = row.representation, row.fitting
+            except Exception as error:  # whatever a foreign module lacks
+                found[key] = _one_line(error)
     return found
+
+
+def representations() -> dict[str, type[Any]]:
+    """Classes of representations by method, of those whose module can be loaded."""
+    return {key: row.representation for key, row in usable_methods().items()}
 
 
 def broken_points() -> list[BrokenPoint]:
     """Entry points of installed packages, of all groups, that cannot be used."""
     groups = [group for group in GROUPS if group != ENTRY_POINT_GROUP]
     others = [one for group in groups for one in usable_points(group)[1].values()]
-    return [*_all_methods()[1].values(), *others]
+    packages = {point.name: _package(point) for point in entry_points(group=ENTRY_POINT_GROUP)}
+    modules = [
+        BrokenPoint(ENTRY_POINT_GROUP, key, packages.get(key, "unknown"), reason)
+        for key, reason in _unloadable().items()
+    ]
+    return [*_all_methods()[1].values(), *modules, *others]
 
 
 def method(key: str, *, file: PathLike | None = None) -> Method:

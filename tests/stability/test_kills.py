@@ -150,3 +150,32 @@ def test_a_killed_validation_goes_on(tmp_path, rng):
         cells = json.loads(done.stdout)["cells"]
         found.append([(c["name"], c["outcome"], c["gates"]) for c in cells])
     assert found[0] == found[1]
+
+
+def test_a_terminated_validation_leaves_no_process(tmp_path):
+    """SIGTERM ends the workers too."""
+    command = [
+        "validate",
+        "--quick",
+        "--only",
+        "raw,svd",
+        "--no-report",
+        "--workers",
+        "2",
+        "--cache",
+        str(tmp_path),
+    ]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "btfref", *command],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    with pytest.raises(subprocess.TimeoutExpired):
+        process.wait(20)
+    process.send_signal(signal.SIGTERM)
+    _, said = process.communicate()
+    assert (process.returncode, said) == (143, b"btfref: error: terminated\n")
+    with pytest.raises(ProcessLookupError):
+        os.killpg(process.pid, 0)
