@@ -88,6 +88,11 @@ def _draft(out: Path) -> Iterator[Path]:
     folder = tempfile.mkdtemp(prefix=prefix, suffix=".partial", dir=parent)
     try:
         yield Path(folder, out.name)
+    except OSError as error:
+        # Of the draft, whose name nobody knows, or of a stream without one: a full disk, say.
+        if error.errno is None or not (error.filename is None or str(error.filename).startswith(folder)):
+            raise
+        raise OSError(error.errno, os.strerror(error.errno), str(out)) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 

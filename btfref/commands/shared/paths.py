@@ -74,11 +74,20 @@ def _inputs(args: Namespace, written: Collection[str]) -> Iterator[Path]:
             continue
         for text in _texts(value):
             for word in {text, text.partition("=")[2], *text.partition("=")[2].split(",")}:
-                path = Path(word)
-                if word and _exists(path):
+                # Parameters of a scene name files beside it, too.
+                for path in (Path(word), *(folder / word for folder in _scene_folders(args))):
+                    if not word or not _exists(path):
+                        continue
                     yield path
                     if path.suffix.lower() == ".xml":
                         yield from _of_scene(path)
+
+
+def _scene_folders(args: Namespace) -> Iterator[Path]:
+    """Folders of the scene files that a command reads."""
+    for text in _texts([getattr(args, name, None) for name in ("scene", "scenes", "reference")]):
+        if text.endswith(".xml"):
+            yield Path(text).parent
 
 
 def _texts(value: object) -> Iterator[str]:

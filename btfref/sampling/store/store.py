@@ -88,8 +88,14 @@ def create_store(
     # A fixed name: what a killed run left is found and removed by the next one.
     draft = path.with_name(path.name + DRAFT)
     shutil.rmtree(draft, ignore_errors=True)
-    write_headers(draft, views, lights, texels, dtype, variance, tile, attributes, adaptive)
-    os.rename(draft, path)
+    try:
+        write_headers(draft, views, lights, texels, dtype, variance, tile, attributes, adaptive)
+        os.rename(draft, path)
+    except BaseException as error:
+        shutil.rmtree(draft, ignore_errors=True)
+        if isinstance(error, OSError) and error.errno is not None:
+            raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
+        raise
     return BTFStore(path)
 
 

@@ -121,6 +121,28 @@ def test_streams_of_all_kinds(material):
     assert b"closed" in closed.stderr
 
 
+def test_a_full_place(material, tmp_path, need):
+    """The system refuses to write more: one line that says so, and no word of damage; nothing is left."""
+    need("llvm")
+    store = material / "good.btf.zarr"
+    for command in (
+        f"fit raw {store} -o out.exr",
+        f"export {store} --format bonn -o out.btf",
+        "synth flat -o out.btf.zarr --texels 16 --spp 2",
+    ):
+        done = subprocess.run(
+            ["/bin/bash", "-c", f"ulimit -f 1; exec {sys.executable} -m btfref {command}"],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )
+        assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+        assert done.stderr.startswith("btfref: error: out"), done.stderr
+        assert "File too large" in done.stderr
+        assert list(tmp_path.iterdir()) == []
+
+
 def test_a_terminated_command_leaves_nothing(tmp_path, need):
     """SIGTERM ends a synthesis with its own status, and its lock with it."""
     need("llvm")
