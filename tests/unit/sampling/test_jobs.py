@@ -65,6 +65,20 @@ def test_a_job_of_another_kind_is_refused(tmp_path, change, words):
         read_job(tmp_path / "job")
 
 
+def test_a_worker_that_does_not_see_the_folder_says_so(tmp_path, need):
+    need("distributed")
+    from btfref.sampling.scheduling import _work
+
+    with pytest.raises(InputError, match="does not see the folder"):
+        _work(
+            str(tmp_path / "job"),
+            str(tmp_path / "x.btf.zarr"),
+            [0],
+            "synthesis",
+            {"memory": None, "threads": 1},
+        )
+
+
 def test_one_process_writes_a_store(tmp_path):
     """The second one is told who; nothing has to be removed after the first was killed."""
     store = tmp_path / "x.btf.zarr"
