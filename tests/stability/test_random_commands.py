@@ -153,8 +153,8 @@ GRAMMAR = {
         {"--grid": ["1", "x"], "-D": WORDS, "--views": SETS, "--margin": NUMBERS},
     ),
     "bench": ([["none", "compare", "report", *FILES], FILES], {"-o": OUTPUTS}),
-    "validate": ([], {"--only": ["none"], "--workers": NUMBERS[3:4], "-o": OUTPUTS}),
-    "stress": ([], {"--only": ["none", "x"], "-o": OUTPUTS, "--seed": NUMBERS}),
+    "validate": ([["--only"], ["none"]], {"--workers": NUMBERS[3:4], "-o": OUTPUTS}),
+    "stress": ([["--only"], ["none", "x"]], {"-o": OUTPUTS, "--seed": NUMBERS}),
     "none": ([FILES], {}),
 }
 
