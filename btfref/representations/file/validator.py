@@ -8,6 +8,7 @@ other, the tables of directions are those of the directions, constants are those
 from __future__ import annotations
 
 import math
+import re
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -47,6 +48,9 @@ DUAL_TOLERANCE = 1e-5
 MOST_ENTRIES = 2**32 - 1
 
 _KINDS = ("view", "light")
+
+#: Constants that are an array of numbers in GLSL.
+_NUMBERS = re.compile(r"(int|float)\[\d+\]\([-+.,\de ]*\)")
 
 
 class _Check:
@@ -95,8 +99,10 @@ def check_layout(manifest: Facts, kind: object, path: PathLike) -> None:
                 "meta.texels", [rows, columns], "rows and columns of a map", "no map has these texels"
             )
         for name, value in meta["constants"].items():
-            if not isinstance(value, bool | int | float):
-                check.refuse(f"meta.constants.{name}", value, "a number", "damaged manifest")
+            listed = isinstance(value, str) and _NUMBERS.fullmatch(value) is not None
+            if not (isinstance(value, bool | int | float) or listed):
+                expected = "a number, or numbers such as int[2](3, 4)"
+                check.refuse(f"meta.constants.{name}", repr(value)[:60], expected, "damaged manifest")
         return
     try:
         schema = kind.schema(meta, own.keys())
