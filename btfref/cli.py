@@ -144,6 +144,14 @@ def _terminate(*_: object) -> NoReturn:
     raise _Terminated
 
 
+def _say_no_more(argv: Sequence[str] | None) -> None:
+    """Threads of libraries that are ended in the middle complain on their way out: in a process of ours, to nobody."""
+    if argv is None:
+        with contextlib.suppress(OSError, ValueError):
+            sys.stderr.flush()
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+
+
 def ready_streams() -> None:
     """Standard streams as they must be: there, and able to say whatever a file holds.
 
@@ -208,9 +216,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _complain(_os_error(error))
     except KeyboardInterrupt:
         sys.stderr.write("\nbtfref: interrupted\n")
+        _say_no_more(argv)
         return 130
     except _Terminated:
         _complain("terminated")
+        _say_no_more(argv)
         return 143
     except ImportError as error:
         if error.name is None or error.name.split(".")[0] in ("btfref", "mitsuba_plugins"):
