@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass
 
 from btfref import platform, system
 from btfref.provenance import RELEVANT, versions
+from btfref.registry import broken_points
 from btfref.types import Facts
 
 #: Mitsuba variants that btfref uses, and whether it can do without.
@@ -222,6 +223,7 @@ def examine() -> Examination:
         "gl": gl,
         "gpu": gpu,
         "programs": programs,
+        "broken_packages": [asdict(point) for point in broken_points()],
         "missing": [requirement.name for requirement in system.missing()],
     }
     return Examination(tuple(_checks(facts)), facts)
@@ -234,6 +236,7 @@ def _llvm_environment(llvm: platform.LLVMChoice) -> dict[str, str]:
 def _checks(facts: Facts) -> Iterator[Check]:
     """The lines for a reader, from the facts."""
     yield from _version_checks(facts["versions"])
+    yield from _package_checks(facts["broken_packages"])
     yield from _library_checks(facts["missing"])
     yield from _llvm_checks(facts["llvm"])
     yield from _variant_checks(facts["variants"], facts["gpu"])
@@ -251,6 +254,14 @@ def _version_checks(installed: Mapping[str, str | None]) -> Iterator[Check]:
             yield Check("versions", name, "warning", value, f"pip install {name}=={PINNED[name]}")
         else:
             yield Check("versions", name, "ok", version)
+
+
+def _package_checks(broken: Sequence[Facts]) -> Iterator[Check]:
+    """Packages that would add methods, formats or mesostructures, and cannot."""
+    for point in broken:
+        mend = f"mend or remove the package {point['package']}; everything else works without it"
+        value = f"{point['group']} of {point['package']}: {point['reason']}"
+        yield Check("other packages", point["name"], "warning", value, mend)
 
 
 def _library_checks(missing: Collection[str]) -> Iterator[Check]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
+import socket
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -80,8 +82,35 @@ def new_folder(out: PathLike) -> Iterator[Path]:
 def _draft(out: Path) -> Iterator[Path]:
     """The name of ``out`` in a temporary folder beside it: on the same disk, so that it can be renamed."""
     require_folder_of(out)
-    folder = tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.absolute().parent)
+    parent = out.absolute().parent
+    _remove_abandoned(out.name, parent)
+    prefix = f".{out.name}.{_HOST}-{os.getpid()}-"
+    folder = tempfile.mkdtemp(prefix=prefix, suffix=".partial", dir=parent)
     try:
         yield Path(folder, out.name)
+    except OSError as error:
+        # Of the draft, whose name nobody knows, or of a stream without one: a full disk, say.
+        if error.errno is None or not (error.filename is None or str(error.filename).startswith(folder)):
+            raise
+        raise OSError(error.errno, os.strerror(error.errno), str(out)) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+#: Name of this machine as it stands in names of drafts.
+_HOST = re.sub(r"[^A-Za-z0-9]", "_", socket.gethostname())[:32] or "host"
+
+
+def _remove_abandoned(name: str, parent: Path) -> None:
+    """Remove drafts of an output that processes of this machine have left which are no more: they were killed."""
+    pattern = re.compile(rf"\.{re.escape(name)}\.{_HOST}-(\d+)-\w+\.partial")
+    for draft in parent.iterdir():
+        found = pattern.fullmatch(draft.name)
+        if found is None:
+            continue
+        try:
+            os.kill(int(found[1]), 0)
+        except ProcessLookupError:
+            shutil.rmtree(draft, ignore_errors=True)
+        except (OSError, OverflowError):
+            continue

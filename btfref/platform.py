@@ -134,6 +134,32 @@ def prepare_llvm() -> str:
     return choice.path
 
 
+def set_variant(name: str) -> None:
+    """Set a variant of Mitsuba.
+
+    Parameters
+    ----------
+    name : str
+        One of ``mitsuba.variants()``.
+
+    Raises
+    ------
+    MissingDependencyError
+        Where this machine lacks what the variant computes with.
+    """
+    import mitsuba as mi
+
+    try:
+        mi.set_variant(name)
+    except (ImportError, RuntimeError) as error:
+        what = "a CUDA device" if name.startswith("cuda") else "a library"
+        said = " ".join(str(error).split())
+        raise MissingDependencyError(
+            f"{what} is missing for Mitsuba's variant {name} ({said})",
+            "see btfref doctor, or use llvm_ad_rgb",
+        ) from error
+
+
 def shader_directory() -> Path:
     """Directory of the GLSL library: ``shaders/`` of a checkout, else the copy inside the installed package.
 

@@ -6,14 +6,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from inspect import signature
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from btfref.errors import InputError
+from btfref.errors import BtfrefError, InputError
 
 if TYPE_CHECKING:
     from btfref.types import Facts, PathLike
@@ -21,11 +21,76 @@ if TYPE_CHECKING:
 #: Third parties add rows with entry points of this group; each names an object of type :class:`Method`.
 ENTRY_POINT_GROUP = "btfref.representations"
 
+#: All groups: methods, formats of files, mesostructures.
+GROUPS = (ENTRY_POINT_GROUP, "btfref.formats", "btfref.mesostructures")
+
 
 def imported(place: str) -> Any:
     """What ``module:object`` names."""
     module, _, name = place.partition(":")
     return getattr(import_module(module), name)
+
+
+@dataclass(frozen=True)
+class BrokenPoint:
+    """An entry point of a package that cannot be used.
+
+    Attributes
+    ----------
+    group, name : str
+    package : str
+        Name and version of the package that has it.
+    reason : str
+        One line.
+    """
+
+    group: str
+    name: str
+    package: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"'{self.name}' of the package {self.package} cannot be used: {self.reason}"
+
+
+def _package(point: EntryPoint) -> str:
+    dist = point.dist
+    return f"{dist.name} {dist.version}" if dist is not None else "unknown"
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())[:300]
+
+
+@cache
+def usable_points(group: str, kind: type | None = None) -> tuple[dict[str, Any], dict[str, BrokenPoint]]:
+    """Objects of the entry points of a group by name, and those that cannot be had.
+
+    Parameters
+    ----------
+    group : str
+    kind : type, optional
+        What an object must be.
+
+    Returns
+    -------
+    usable : dict of str to object
+    broken : dict of str to BrokenPoint
+    """
+    usable: dict[str, Any] = {}
+    broken: dict[str, BrokenPoint] = {}
+    for point in sorted(entry_points(group=group), key=lambda p: (p.name, p.value)):
+        try:
+            found = point.load()
+            if kind is not None and not isinstance(found, kind):
+                raise TypeError(f"{point.value} is a {type(found).__name__}, not a {kind.__name__}")
+            if point.name in usable:
+                raise ValueError("another package has that name already")
+        except (Exception, SystemExit) as error:  # whatever a foreign module raises costs that package alone
+            broken[point.name] = BrokenPoint(group, point.name, _package(point), _one_line(error))
+        else:
+            usable[point.name] = found
+    return usable, broken
 
 
 @dataclass(frozen=True)
@@ -47,9 +112,9 @@ class Catalogue:
     group: str
 
     def names(self) -> list[str]:
-        """Names of all: btfref's own in their order, then the others in theirs of the alphabet."""
-        found = {point.name for point in entry_points(group=self.group)}
-        return [*self.rows, *sorted(found - self.rows.keys())]
+        """Names of all: btfref's own in their order, then those of packages that can be loaded, by the alphabet."""
+        found, _ = usable_points(self.group)
+        return [*self.rows, *sorted(found.keys() - self.rows.keys())]
 
     def load(self, name: str) -> Any:
         """The object of that name.
@@ -57,12 +122,15 @@ class Catalogue:
         Raises
         ------
         InputError
-            When there is none.
+            When there is none, or its package cannot be loaded.
         """
         if name in self.rows:
             return imported(self.rows[name])
-        for point in entry_points(group=self.group, name=name):
-            return point.load()
+        found, broken = usable_points(self.group)
+        if name in found:
+            return found[name]
+        if name in broken:
+            raise InputError(f"a {self.kind} of another package: {broken[name]}", field=self.kind)
         raise InputError(
             f"unknown {self.kind}",
             field=self.kind,
@@ -110,15 +178,31 @@ class Method:
     fit_module: str = ""
     editing: str = ""
 
+    def _part(self, module: str) -> ModuleType:
+        """A module of the method; what it fails at is said with the method's name."""
+        try:
+            return import_module(module)
+        except Exception as error:
+            if not module.startswith(("btfref.", "mitsuba_plugins.")):
+                raise BtfrefError(
+                    f"the method '{self.key}' cannot be loaded: {module}: {_one_line(error)}"
+                ) from error
+            raise
+
     @property
     def representation(self) -> type[Any]:
         """The class that holds the method's maps and evaluates them in float64."""
-        return import_module(self.module).Representation
+        return self._part(self.module).Representation
 
     @property
     def fitting(self) -> ModuleType:
         """The module that makes representations: a :class:`btfref.representations.protocol.FitModule`."""
-        return import_module(self.fit_module or self.module)
+        return self._part(self.fit_module or self.module)
+
+    @property
+    def evaluator(self) -> type[Any]:
+        """The Dr.Jit port, of the current Mitsuba variant."""
+        return self._part(self.plugin).Evaluator
 
     @property
     def fit(self) -> Callable[..., Any]:
@@ -176,7 +260,7 @@ class Method:
     @property
     def editor(self) -> ModuleType:
         """The module that writes maps as pictures for editing and reads them back."""
-        return import_module(self.editing)
+        return self._part(self.editing)
 
 
 def _row(
@@ -260,26 +344,65 @@ _ROWS = (
 
 @cache
 def methods() -> dict[str, Method]:
-    """All methods by key, those of installed third-party packages included.
+    """All methods by key, those of installed third-party packages included, where these can be loaded.
 
     Returns
     -------
     dict of str to Method
-
-    Raises
-    ------
-    InputError
-        When two packages claim one key.
     """
+    return _all_methods()[0]
+
+
+@cache
+def _all_methods() -> tuple[dict[str, Method], dict[str, BrokenPoint]]:
+    """Methods by key, and entry points that give none."""
     rows = {row.key: row for row in _ROWS}
-    for point in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda p: (p.name, p.value)):
-        row = point.load()
+    usable, broken = usable_points(ENTRY_POINT_GROUP, Method)
+    broken = dict(broken)
+    packages = {point.name: _package(point) for point in entry_points(group=ENTRY_POINT_GROUP)}
+    for name, row in usable.items():
         if row.key in rows:
-            raise InputError(
-                "two packages provide one method", field=ENTRY_POINT_GROUP, got=f"{row.key} ({point.value})"
-            )
-        rows[row.key] = row
-    return rows
+            taken = f"the method '{row.key}' is there already"
+            broken[name] = BrokenPoint(ENTRY_POINT_GROUP, name, packages[name], taken)
+        else:
+            rows[row.key] = row
+    return rows, broken
+
+
+def usable_methods() -> dict[str, Method]:
+    """Methods by key, those of other packages only where their modules can be loaded too: what "all methods" means."""
+    return {key: row for key, row in methods().items() if key not in _unloadable()}
+
+
+@cache
+def _unloadable() -> dict[str, str]:
+    """Methods of other packages whose modules cannot be loaded, and why."""
+    own = {row.key for row in _ROWS}
+    found = {}
+    for key, row in methods().items():
+        if key not in own:
+            try:
+                _ = row.representation, row.fitting
+            except Exception as error:  # whatever a foreign module lacks
+                found[key] = _one_line(error)
+    return found
+
+
+def representations() -> dict[str, type[Any]]:
+    """Classes of representations by method, of those whose module can be loaded."""
+    return {key: row.representation for key, row in usable_methods().items()}
+
+
+def broken_points() -> list[BrokenPoint]:
+    """Entry points of installed packages, of all groups, that cannot be used."""
+    groups = [group for group in GROUPS if group != ENTRY_POINT_GROUP]
+    others = [one for group in groups for one in usable_points(group)[1].values()]
+    packages = {point.name: _package(point) for point in entry_points(group=ENTRY_POINT_GROUP)}
+    modules = [
+        BrokenPoint(ENTRY_POINT_GROUP, key, packages.get(key, "unknown"), reason)
+        for key, reason in _unloadable().items()
+    ]
+    return [*_all_methods()[1].values(), *modules, *others]
 
 
 def method(key: str, *, file: PathLike | None = None) -> Method:
@@ -290,7 +413,9 @@ def method(key: str, *, file: PathLike | None = None) -> Method:
     InputError
         When there is none.
     """
-    rows = methods()
+    rows, broken = _all_methods()
+    if key not in rows and key in broken:
+        raise InputError(f"a method of another package: {broken[key]}", file=file, field="method")
     if key not in rows:
         raise InputError("unknown method", file=file, got=repr(key), expected=f"one of {', '.join(rows)}")
     return rows[key]

@@ -5,7 +5,6 @@ Nothing else in the project uses ``wi`` and ``wo``.
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -111,7 +110,7 @@ def make_bsdf() -> type:
             self.affine = affine.tolist()
             self.key = representation.meta["method"]
             self.maps = Maps(representation, self.filter_type)
-            self.evaluator = import_module(method(self.key).plugin).Evaluator(self.maps)
+            self.evaluator = method(self.key).evaluator(self.maps)
             self.detail = self._level_of_detail(props)
             self.own_share = self._share_of_own_lobes(props)
             if self.own_share < 1:

@@ -175,10 +175,10 @@ def read_plan(path: PathLike, *, quick: bool = False, only: Iterable[str] | None
 
 def _entries(found: Facts, path: PathLike) -> list[Entry]:
     from btfref.bench.subjects import PEERS
-    from btfref.registry import methods
+    from btfref.registry import methods, usable_methods
 
     queries = _combinations(found.get("query", {}), path)
-    rows = found.get("method", [{"key": key} for key in methods()])
+    rows = found.get("method", [{"key": key} for key in usable_methods()])
     entries: list[Entry] = []
     for row in rows:
         _known(row, ("key", "name", "build", "query", "bytes_of"), path, "method")

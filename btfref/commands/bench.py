@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from btfref.bench import PICTURED, SUITES
 from btfref.bench.plan import SUFFIX, shipped
-from btfref.commands.shared.options import add_json, add_only, words
+from btfref.commands.shared.options import add_json, add_only, add_overwrite, words
 from btfref.commands.shared.printing import Progress, emit, emit_json, table
 from btfref.commands.shared.reading import output_file
 from btfref.errors import InputError
@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 #: Words in the place of a suite that read results instead.
 READERS = ("compare", "report")
+
+#: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
+OUTPUTS = {"output": "", "plot": "picture", "report": "page"}
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -49,6 +52,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--report", metavar="FILE.html", help="a page with the pictures, of suites that have any"
     )
     add_json(parser, "metrics or the raw result")
+    add_overwrite(parser)
 
 
 def run(args: Namespace) -> int:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from btfref.commands.shared.images import load_classes
-from btfref.commands.shared.options import add_define, add_grid, add_json, add_size
+from btfref.commands.shared.options import add_define, add_grid, add_json, add_overwrite, add_size
 from btfref.commands.shared.printing import GATE_HEADER, emit, emit_json, gate_cells, number, table
 from btfref.commands.shared.reading import assignments, output_file
 from btfref.errors import InputError
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     import numpy as np
 
     from btfref.comparison import Comparison
+
+#: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
+OUTPUTS = {"report": "page"}
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -43,6 +46,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     scene.add_argument("--shadows", action="store_true", help="the picture has cast shadows")
     scene.add_argument("--cache", metavar="FOLDER", help="of references (default: the user's cache)")
     add_json(parser, "metrics and gates")
+    add_overwrite(parser)
     parser.add_argument("--report", metavar="OUT.html", help="also write a report")
 
 

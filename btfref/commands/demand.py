@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from btfref.commands.shared.options import add_define, add_grid, add_json, add_size, help_with_scenes
 from btfref.commands.shared.printing import Progress, emit, emit_json, table
 from btfref.commands.shared.reading import assignments, count, direction_set, number_above
-from btfref.errors import InputError
+from btfref.errors import TEXELS, InputError
 
 if TYPE_CHECKING:
     from btfref.numerics.sphere.directions import DirectionSet
@@ -34,7 +34,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     add_scene_arguments(parser)
     parser.add_argument("--views", metavar="SET", help="of a BTF that is not there yet, as for synth")
     parser.add_argument("--lights", metavar="SET", help="likewise (default: as the views)")
-    parser.add_argument("--texels", type=count(1), metavar="N", help="likewise, per side (default 64)")
+    parser.add_argument(
+        "--texels", type=count(1, TEXELS), metavar="N", help="likewise, per side (default 64)"
+    )
     add_json(parser, "numbers and indices")
 
 

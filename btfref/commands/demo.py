@@ -16,6 +16,9 @@ from btfref.commands.shared.printing import GATE_HEADER, Progress, emit, emit_js
 if TYPE_CHECKING:
     from btfref.demo import DemoResult
 
+#: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
+OUTPUTS = {"output": "folder"}
+
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""

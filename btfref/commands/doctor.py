@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from btfref.commands.shared.options import add_json
-from btfref.commands.shared.printing import bytes_text, emit, emit_json
+from btfref.commands.shared.printing import bytes_text, emit, emit_json, printable
 from btfref.errors import MissingDependencyError
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def run(args: Namespace) -> int:
         emit_json(examination.to_dict())
     else:
         for line in lines(examination, colour=sys.stdout.isatty()):
-            emit(line)
+            emit(line, coloured=True)
     return 0 if examination.ok else 1
 
 
@@ -61,13 +61,13 @@ def lines(examination: Examination, *, colour: bool = False) -> Iterator[str]:
             yield ""
             yield paint(group[0].upper() + group[1:], "1")
         mark, code = _MARKS[check.status]
-        yield f"  {paint(mark, code)} {check.name:<17} {check.value}"
+        yield f"  {paint(mark, code)} {printable(check.name):<17} {printable(check.value)}"
     troubles = [check for check in examination.checks if check.mend]
     yield ""
     for check in troubles:
         mark, code = _MARKS[check.status]
-        yield f"{paint(mark, code)} {check.name}: {check.value}"
-        yield f"    {check.mend}"
+        yield f"{paint(mark, code)} {printable(check.name)}: {printable(check.value)}"
+        yield f"    {printable(check.mend)}"
     yield (
         paint("All that btfref needs works here.", "32")
         if examination.ok

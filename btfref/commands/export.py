@@ -10,7 +10,7 @@ from argparse import ArgumentParser, Namespace
 
 from btfref.commands.shared.options import add_json
 from btfref.commands.shared.printing import Progress, emit, emit_json, number
-from btfref.commands.shared.reading import count, number_above, output_file
+from btfref.commands.shared.reading import assignments, count, number_above, output_file
 from btfref.errors import InputError
 
 #: Option -> what it is called in the library, where that differs.
@@ -27,6 +27,9 @@ _SETTINGS = (
     "scalar",
 )
 
+#: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
+OUTPUTS = {"output": ""}
+
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
@@ -35,7 +38,13 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument("-o", "--output", required=True, metavar="OUT", help="folder, .zip or .btf to write")
     parser.add_argument(
-        "--format", required=True, choices=("ubo", "utia", "bonn", "maps"), help="whose files to write"
+        "--format",
+        required=True,
+        metavar="NAME",
+        help="whose files to write: ubo, utia, bonn, maps, or a format that an installed package brings",
+    )
+    parser.add_argument(
+        "--set", nargs="+", action="extend", metavar="KEY=VALUE", help="settings of such a format"
     )
     images = parser.add_argument_group("ubo, utia")
     images.add_argument("--image", choices=("jpg", "png", "hdr", "exr"), help="default jpg (ubo), exr (utia)")
@@ -60,6 +69,7 @@ def run(args: Namespace) -> int:
     """Carry the command out."""
     out = output_file(args.output, *{"bonn": (".btf",)}.get(args.format, ()))
     settings = {key: getattr(args, key) for key in _SETTINGS if getattr(args, key) is not None}
+    settings |= assignments(args.set)
 
     with Progress() as progress:
         if args.format == "maps":
@@ -69,8 +79,12 @@ def run(args: Namespace) -> int:
                 raise InputError("maps take no settings", field=next(iter(settings)))
             facts = export_maps(args.btf, out)
         else:
-            from btfref.formats import export_btf
+            from btfref.formats import export_btf, exporters, format_named, names
             from btfref.sampling import open_store
+
+            if args.format not in names() or format_named(args.format).export is None:
+                known = ", ".join([*exporters(), "maps"])
+                raise InputError("no such format to write", field="--format", got=args.format, expected=known)
 
             facts = export_btf(open_store(args.btf), out, args.format, progress=progress, **settings)
     if args.json:

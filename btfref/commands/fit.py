@@ -7,10 +7,13 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from btfref.commands.shared.options import add_json, add_seed
+from btfref.commands.shared.options import add_json, add_overwrite, add_seed
 from btfref.commands.shared.printing import Progress, write_representation
 from btfref.commands.shared.reading import assignments, output_file
 from btfref.errors import InputError
+
+#: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
+OUTPUTS = {"output": "representation"}
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -36,6 +39,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="take a store of which only a part is there, as synth --for fills it (methods that can)",
     )
     add_seed(parser)
+    add_overwrite(parser)
     add_json(parser, "the facts of the file")
 
 

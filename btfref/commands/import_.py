@@ -14,6 +14,9 @@ from btfref.commands.shared.options import add_dtype, add_json
 from btfref.commands.shared.printing import Progress, bytes_text, emit, emit_json, write_representation
 from btfref.commands.shared.reading import count, direction_set, number_above, output_file
 
+#: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
+OUTPUTS = {"output": ""}
+
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from btfref.commands.shared.options import add_json
+from btfref.commands.shared.options import add_json, add_overwrite
 from btfref.commands.shared.printing import bytes_text, emit, emit_json
 from btfref.commands.shared.reading import output_file, ranges
 from btfref.errors import InputError
@@ -24,6 +24,9 @@ _BYTES = (
     *("float_bytes", "half_bytes", "code_bytes", "published_bytes"),
 )
 
+#: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
+OUTPUTS = {"plot": "picture"}
+
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
@@ -31,6 +34,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "file", metavar="FILE", help="representation (.exr), sampled BTF (.btf.zarr), measured BTF, or image"
     )
     add_json(parser, "the facts")
+    add_overwrite(parser)
     parser.add_argument("--plot", metavar="OUT.png", help="draw a sampled BTF")
     parser.add_argument(
         "--texel",
@@ -110,18 +114,18 @@ def _headers(path: Path) -> list[Facts] | None:
     """Headers of an OpenEXR file, or None when it cannot be read as one."""
     if not path.is_file() or path.stat().st_size == 0:
         return None
-    import OpenEXR
+    from btfref.images.openexr import opened
 
     try:
-        with OpenEXR.File(str(path), header_only=True) as file:
+        with opened(path, header_only=True) as file:
             return [dict(part.header) for part in file.parts]  # closing the file empties them
-    except RuntimeError:
+    except (RuntimeError, ValueError, OSError):
         return None
 
 
 def _plain_exr(path: Path) -> bool:
     """Whether this is an OpenEXR image rather than a representation; broken files count as the latter."""
-    from btfref.representations.file.container import ATTRIBUTE
+    from btfref.representations.file.manifest import ATTRIBUTE
 
     headers = _headers(path)
     return headers is not None and ATTRIBUTE not in headers[0]

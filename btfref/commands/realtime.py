@@ -25,11 +25,14 @@ from btfref.commands.shared.options import (
 )
 from btfref.commands.shared.printing import emit, emit_json
 from btfref.commands.shared.reading import assignments, count, output_file
-from btfref.errors import InputError
+from btfref.errors import DIRECTIONS, InputError
 from btfref.rendering.environment_light import PATHS
 
 if TYPE_CHECKING:
     from btfref.rendering.environment_light.transfer import TransferSettings
+
+#: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
+OUTPUTS = {"output": "picture"}
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -43,7 +46,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument(
         "--lights",
-        type=count(1),
+        type=count(1, DIRECTIONS),
         metavar="N",
         help="that stand for it (default: for an estimated error of 1 %%)",
     )

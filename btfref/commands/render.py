@@ -22,14 +22,19 @@ from btfref.commands.shared.options import (
 )
 from btfref.commands.shared.printing import emit
 from btfref.commands.shared.reading import assignments, count, output_file
-from btfref.errors import InputError
+from btfref.errors import SAMPLES, InputError
+
+#: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
+OUTPUTS = {"output": "picture", "classes": "picture"}
 
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
     add_scene(parser)
     add_image(parser)
-    parser.add_argument("--spp", type=count(1), metavar="N", help="samples per pixel (default: the scene's)")
+    parser.add_argument(
+        "--spp", type=count(1, SAMPLES), metavar="N", help="samples per pixel (default: the scene's)"
+    )
     add_seed(parser)
     parser.add_argument("--variant", default="llvm_ad_rgb", metavar="NAME", help="Mitsuba variant")
     add_grid(parser, default=None, text="direct light on a regular grid of N × N sub-pixels")

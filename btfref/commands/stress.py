@@ -12,10 +12,13 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from btfref.commands.shared.options import add_json, add_only, add_seed, words
+from btfref.commands.shared.options import add_json, add_only, add_overwrite, add_seed, words
 from btfref.commands.shared.printing import Progress, emit, emit_json
 from btfref.commands.shared.reading import output_file
 from btfref.errors import InputError
+
+#: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
+OUTPUTS = {"output": "text"}
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -31,6 +34,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--storage", metavar="NAME", help="of the fit, with --case")
     parser.add_argument("-o", "--output", metavar="FILE.md", help="write the tables as Markdown")
     add_json(parser, "everything")
+    add_overwrite(parser)
 
 
 def run(args: Namespace) -> int:

@@ -30,12 +30,16 @@ from btfref.commands.shared.reading import (
     output_file,
     ranges,
 )
-from btfref.errors import InputError
+from btfref.errors import SAMPLES as MANY_SAMPLES
+from btfref.errors import WORKERS, InputError
 from btfref.sampling.settings import ESTIMATORS, MOST_SAMPLES, SAMPLES, SynthesisSettings
 from btfref.types import Facts
 
 #: Options that are parameters of a user's mesh or height map.
 _OWN = ("bsdf", "albedo", "roughness", "amplitude", "tile", "up", "allow_seams")
+
+#: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
+OUTPUTS = {"output": "store"}
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -62,7 +66,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--lights", default=default.lights, metavar="SET", help="likewise")
     parser.add_argument(
         "--spp",
-        type=count(2),
+        type=count(2, MANY_SAMPLES),
         default=default.spp,
         metavar="N",
         help=f"paths (or surface points) per texel and view (default {SAMPLES}); with --target-error the most "
@@ -150,7 +154,10 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="workers of a local Dask cluster, or of the one at tcp://HOST:PORT, whose workers see the same files",
     )
     parser.add_argument(
-        "--workers", type=count(1), metavar="N", help="of the local cluster (default: one per two processors)"
+        "--workers",
+        type=count(1, WORKERS),
+        metavar="N",
+        help="of the local cluster (default: one per two processors)",
     )
     parser.add_argument(
         "--variant", default=default.variant, help="of Mitsuba (default %(default)s; cuda_ad_rgb)"

@@ -15,9 +15,13 @@ from typing import TYPE_CHECKING
 from btfref.commands.shared.options import add_json, add_only, words
 from btfref.commands.shared.printing import Progress, emit, emit_json, number, table
 from btfref.commands.shared.reading import count
+from btfref.errors import WORKERS
 
 if TYPE_CHECKING:
     from btfref.validate.run import Validation
+
+#: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
+OUTPUTS = {"output": "folder"}
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -36,7 +40,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--cache", metavar="FOLDER", help="of results (default: BTFREF_CACHE, else the user's cache)"
     )
     parser.add_argument(
-        "--workers", type=count(1), metavar="N", help="processes (default: by cores and memory)"
+        "--workers", type=count(1, WORKERS), metavar="N", help="processes (default: by cores and memory)"
     )
     parser.add_argument("--no-report", action="store_true", help="numbers only")
     add_json(parser, "the result")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from btfref.errors import InputError
+from btfref.errors import BtfrefError, InputError
 from btfref.registry import Catalogue
 from btfref.types import Facts, PathLike
 
@@ -22,6 +22,7 @@ __all__ = [
     "ENTRY_POINT_GROUP",
     "FORMATS",
     "export_btf",
+    "exporters",
     "format_named",
     "identify",
     "import_btf",
@@ -47,6 +48,11 @@ _CATALOGUE = Catalogue("format", FORMATS, ENTRY_POINT_GROUP)
 def names() -> list[str]:
     """Names of all formats, built in and from entry points."""
     return _CATALOGUE.names()
+
+
+def exporters() -> list[str]:
+    """Names of the formats that can be written, those of installed packages too."""
+    return [name for name in names() if format_named(name).export is not None]
 
 
 def format_named(name: str) -> Format:
@@ -80,7 +86,17 @@ def identify(path: PathLike) -> str | None:
     from btfref.formats.image_sets.files import Candidate
 
     candidate = Candidate(path)
-    return next((name for name in names() if format_named(name).recognises(candidate)), None)
+    for name in names():
+        try:
+            if format_named(name).recognises(candidate):
+                return name
+        except BtfrefError:
+            raise
+        except Exception:
+            # A format of another package that fails at a file costs itself alone.
+            if name in FORMATS:
+                raise
+    return None
 
 
 def open_source(path: PathLike, *, format: str | None = None, **options: object) -> Source:

@@ -13,9 +13,10 @@ from btfref.formats.source import MEMORY, Source
 from btfref.outputs import require_folder_of
 from btfref.provenance import versions
 from btfref.sampling.store.layout import TILE, remove_leftovers, remove_store
+from btfref.sampling.store.lock import writing
 from btfref.sampling.store.resume import resumable
 from btfref.sampling.store.store import BTFStore, create_store
-from btfref.types import PathLike, Progress
+from btfref.types import Facts, PathLike, Progress
 
 
 def import_btf(
@@ -89,7 +90,7 @@ def import_btf(
     included = source.cosine_included if cosine is None else cosine == "included"
     scale = float(source.scale if scale is None else scale)
     block = _lights_at_a_time(source, dtype, memory)
-    attributes = {
+    attributes: Facts = {
         "seed": None,
         "parameters": {
             "cosine_included": included,
@@ -103,7 +104,7 @@ def import_btf(
             "kind": "measured-btf",
             "name": source.path.name,
             "format": source.format,
-            "fingerprint": source.fingerprint,
+            "fingerprint": source.digest(),
             "images_missing": int((~source.present).sum()),
             "lights_moved": [
                 {"view": int(v), "light": int(light), "stood_at_degrees": [float(a) for a in angles]}
@@ -112,6 +113,16 @@ def import_btf(
         },
         "versions": versions(("numpy",)),
     }
+    with writing(out):
+        return _converted(source, out, attributes, overwrite, block, progress)
+
+
+def _converted(
+    source: Source, out: Path, attributes: Facts, overwrite: bool, block: int, progress: Progress | None
+) -> BTFStore:
+    """:func:`import_btf`, while no other process writes there."""
+    settings = attributes["parameters"]
+    included, scale, rows, dtype = (settings[k] for k in ("cosine_included", "scale", "rows", "dtype"))
     remove_leftovers(out)
     store = None
     if out.exists() or out.is_symlink():

@@ -7,7 +7,6 @@ sampled by the square root of its share of a right angle. Negative entries mark 
 
 from __future__ import annotations
 
-import hashlib
 import struct
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -79,7 +78,7 @@ def open_merl(
         colours=colours,
         cosine_included=False,
         facts={"table": counts, "file_bytes": reader.size},
-        fingerprint=hashlib.sha256(reader.map[: 1 << 20]).hexdigest()[:32],
+        fingerprint=reader.digest,
     )
 
 

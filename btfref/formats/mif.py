@@ -6,7 +6,6 @@ the light's cosine; XYZ under D65 unless the XML names another colour space, 8 a
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -100,7 +99,7 @@ def open_mif(path: PathLike, *, allow_missing: bool = False) -> Source:
         facts={"images": len(images), "colour_space": space, "file_bytes": reader.size},
         present=found.present,
         moved=found.moved,
-        fingerprint=hashlib.sha256(reader.map[:4096] + text + str(reader.size).encode()).hexdigest()[:32],
+        fingerprint=reader.digest,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import mmap
 import struct
 from collections.abc import Sequence
@@ -81,6 +82,13 @@ class Reader:
             count *= int(side)  # Python integers: sizes from a header may overflow 64 bits
         at = self.take(field, count * dtype.itemsize)
         return np.frombuffer(self.map, dtype, count, at).reshape(shape)
+
+    def digest(self) -> str:
+        """Fingerprint of all bytes of the file."""
+        state = hashlib.sha256()
+        for first in range(0, self.size, 1 << 24):
+            state.update(self.map[first : first + (1 << 24)])
+        return state.hexdigest()[:32]
 
     def text(self, field: str, n: int) -> str:
         """Bytes as text: cut at the first NUL, unknown characters replaced."""

@@ -60,8 +60,9 @@ class Source:
         What was measured; all by default.
     moved : dict of (int, int) to (float, float)
         Pairs measured with the light elsewhere: (view, light) -> polar angle and azimuth in degrees.
-    fingerprint : str
-        Changes with the content, as far as headers, names and sizes show it; a resumed run checks it.
+    fingerprint : callable or str
+        ``() -> str``: changes with the content, every byte of it; a resumed run checks it. Asked by conversions alone,
+        since it reads the whole. Archives have checksums of their files already.
     """
 
     path: Path
@@ -75,13 +76,17 @@ class Source:
     facts: Facts = field(default_factory=dict)
     present: np.ndarray = field(default_factory=lambda: np.array(True))
     moved: dict[tuple[int, int], tuple[float, float]] = field(default_factory=dict)
-    fingerprint: str = ""
+    fingerprint: Callable[[], str] | str = ""
     memory: int = MEMORY
 
     def __post_init__(self) -> None:
         # Damaged values may be infinite or NaN: whoever stores them checks; arithmetic with them is no error here.
         self.colours = np.errstate(over="ignore", invalid="ignore")(self.colours)
         self.present = np.array(np.broadcast_to(self.present, (len(self.views), len(self.lights))))
+
+    def digest(self) -> str:
+        """The fingerprint."""
+        return self.fingerprint if isinstance(self.fingerprint, str) else self.fingerprint()
 
     def info(self) -> Facts:
         """Facts from the headers; JSON types, keys as those of a store where they mean the same."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import struct
 import tempfile
@@ -15,6 +14,7 @@ from numpy.typing import DTypeLike
 
 from btfref.errors import InputError
 from btfref.images import radiance
+from btfref.images.openexr import opened, write
 from btfref.types import PathLike
 
 if TYPE_CHECKING:
@@ -180,18 +180,12 @@ def _exr_header(data: bytes, where: PathLike) -> tuple[int, int, tuple[str, ...]
 
 
 def _exr(data: bytes, where: PathLike, channels: tuple[str, ...], shape: tuple[int, int]) -> np.ndarray:
-    import OpenEXR
-
     # The bindings read files by name only.
     with tempfile.NamedTemporaryFile(suffix=".exr") as stream:
         stream.write(data)
         stream.flush()
         try:
-            # They print a warning of what they then raise.
-            with (
-                contextlib.redirect_stdout(io.StringIO()),
-                OpenEXR.File(stream.name, separate_channels=True) as file,
-            ):
+            with opened(stream.name, separate_channels=True) as file:
                 found = file.channels()
                 planes = [np.asarray(found[name].pixels, np.float32) for name in channels]
         except Exception as error:  # the bindings raise several kinds for a broken file
@@ -217,4 +211,4 @@ def write_exr(planes: Mapping[str, np.ndarray], path: PathLike, dtype: DTypeLike
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     channels = {name: np.ascontiguousarray(plane, dtype) for name, plane in planes.items()}
-    OpenEXR.File(header, channels).write(str(path))
+    write(header, path, channels)

@@ -11,9 +11,13 @@ from numpy.typing import ArrayLike
 
 from btfref.errors import InputError
 from btfref.images.display import Display
+from btfref.images.openexr import opened, write
 from btfref.numerics.colour import decode_srgb
 from btfref.outputs import new_file
 from btfref.types import PathLike
+
+#: Pixels of a display window that is filled: a picture of 16 384².
+MOST_PIXELS = 1 << 28
 
 _MAGIC = {".exr": b"\x76\x2f\x31\x01", ".png": b"\x89PNG\r\n\x1a\n"}
 
@@ -95,7 +99,7 @@ def save_image(
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(attributes or {})}
         channels = {"RGB": np.ascontiguousarray(image, np.float32)}
         with new_file(path) as draft:
-            OpenEXR.File(header, channels).write(str(draft))
+            write(header, draft, channels)
     elif kind == ".png":
         from btfref.images.png import encode_png
 
@@ -107,10 +111,8 @@ def save_image(
 
 
 def _load_exr(path: Path) -> np.ndarray:
-    import OpenEXR
-
     try:
-        with OpenEXR.File(str(path)) as file:
+        with opened(path) as file:
             header = dict(file.header())
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except Exception as error:  # the bindings raise several kinds for a broken file
@@ -128,6 +130,17 @@ def _load_exr(path: Path) -> np.ndarray:
             raise InputError(
                 "no colour", file=path, field="channels", got=sorted(channels), expected="R, G, B or Y"
             )
+    (left, top), (right, bottom) = (np.asarray(corner).tolist() for corner in header["displayWindow"])
+    width, height = right - left + 1, bottom - top + 1
+    if width < 1 or height < 1 or width * height > MOST_PIXELS:
+        expected = f"1 to {MOST_PIXELS} pixels"
+        raise InputError(
+            "size of a picture",
+            file=path,
+            field="displayWindow",
+            got=f"{width} × {height}",
+            expected=expected,
+        )
     return _in_display_window(pixels.astype(np.float32), header)
 
 

@@ -97,10 +97,10 @@ def read_image(path: PathLike, *, field: str = "file") -> np.ndarray:
 
 
 def _read_exr(path: Path, field: str) -> np.ndarray:
-    import OpenEXR
+    from btfref.images.openexr import opened
 
     try:
-        with OpenEXR.File(str(path)) as file:
+        with opened(path) as file:
             channels = {name: np.array(c.pixels, np.float32) for name, c in file.channels().items()}
     except (RuntimeError, OSError, ValueError) as error:
         raise InputError("cannot read the image", file=path, field=field, got=error) from None

@@ -58,7 +58,7 @@ def overview(cells: Sequence[Cell]) -> str:
     names = {key: escape(key).replace(".", ".<wbr>") for key in groups}
     top = "".join(
         f'<th scope="colgroup" colspan="{len(members)}"><code>{names[key]}</code>'
-        f"<small>{members[0].pixel_class}</small></th>"
+        f"<small>{escape(members[0].pixel_class or '')}</small></th>"
         for key, members in groups.items()
     )
     columns = [gate for members in groups.values() for gate in members]
@@ -86,7 +86,7 @@ def _row(index: int, cell: Cell, columns: Sequence[str]) -> str:
             continue
         title = escape(f"{gate.sign} {number(gate.limit)}. {gate.detail}")
         sign = {"fail": " ✗", "inconclusive": " ?"}.get(gate.outcome, "")
-        values.append(f'<td class="{gate.outcome}" title="{title}">{number(gate.value)}{sign}</td>')
+        values.append(f'<td class="{gate.outcome}" title="{title}">{escape(number(gate.value))}{sign}</td>')
     measured = (cell.comparison.metrics if cell.comparison else {}).get(PixelClass.INTERIOR.label, {})
     values += [f"<td>{number(measured.get(key))}</td>" for key in SHOWN.values()]
     link = f'<a href="#cell-{index}">{_thumbnails(cell)}<span>{escape(cell.name)}</span></a>'

@@ -108,7 +108,7 @@ def class_table(comparison: Comparison, pictures: str = "") -> str:
     shown = sorted(PixelClass, key=lambda kind: kind == PixelClass.BACKGROUND)
     order = [name for name in (*(kind.label for kind in shown), "all") if name in comparison.metrics]
     epsilon = comparison.settings.get("relmse_epsilon")
-    head = "".join(f'<th scope="col">{name}</th>' for name in order)
+    head = "".join(f'<th scope="col">{escape(name)}</th>' for name in order)
     body = []
     for key, (label, explanation) in ROWS.items():
         if not any(key in comparison.metrics[name] for name in order):
@@ -174,7 +174,7 @@ def gate_list(gates: Iterable[GateResult]) -> str:
     for key, members in groups.items():
         rows = "".join(
             f'<tr class="{gate.outcome}"><th scope="row">{escape(limit_name(gate.entry))}</th>'
-            f"<td>{gate.pixel_class or '–'}</td><td>{number(gate.value)}</td>"
+            f"<td>{escape(gate.pixel_class or '–')}</td><td>{escape(number(gate.value))}</td>"
             f"<td>{gate.sign} {number(gate.limit)}</td>"
             f"<td>{badge(gate.outcome)}</td></tr>"
             + (

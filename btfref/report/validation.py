@@ -85,8 +85,14 @@ def write_validation(
 
 def slug(facts: Facts) -> str:
     """Name of a cell's page."""
-    words = (facts["mesostructure"], facts["method"], facts["scene"], facts["lights"])
-    return "-".join("".join(c if c.isalnum() or c in "_." else "_" for c in Path(str(w)).stem) for w in words)
+    # Scenes and mesostructures may be files; a method's name stays whole, whatever it holds.
+    words = (
+        Path(str(facts["mesostructure"])).stem,
+        str(facts["method"]),
+        Path(str(facts["scene"])).stem,
+        str(facts["lights"]),
+    )
+    return "-".join("".join(c if c.isalnum() or c in "_." else "_" for c in word) for word in words)
 
 
 def _rounded(value: Any, digits: int = 6) -> Any:

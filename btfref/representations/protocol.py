@@ -14,7 +14,7 @@ What Dr.Jit ports provide stands in :mod:`mitsuba_plugins.protocol`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import ArrayLike
 
+    from btfref.representations.file.schema import Schema
     from btfref.sampling.sampled_btf import SampledBTF
     from btfref.sampling.store.store import BTFStore
     from btfref.types import Facts, Progress
@@ -90,6 +91,30 @@ class Representation(Protocol):
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray], meta: Facts) -> Representation:
         """The representation whose :meth:`arrays` and ``meta`` these are."""
+
+
+@runtime_checkable
+class HasSchema(Protocol):
+    """It says what maps and constants its files hold, so that they are checked before a port reads them.
+
+    Asked of the class: a class method. Of a method without it only what all methods share is checked.
+    """
+
+    def schema(self, meta: Facts, names: Collection[str]) -> Schema:
+        """The maps and constants of a file.
+
+        Parameters
+        ----------
+        meta : dict
+            Of the file; what :class:`Representation` lists was checked, all else is as it was found.
+        names : collection of str
+            The maps that there are.
+
+        Raises
+        ------
+        InputError
+            For entries of ``meta`` that are not what the method writes; without the file's name.
+        """
 
 
 @runtime_checkable

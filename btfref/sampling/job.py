@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from btfref.errors import InputError
+from btfref.errors import BtfrefError, InputError
 from btfref.mesostructure import build
 from btfref.mesostructure.materials import load_bsdf
 from btfref.provenance import LLVM, versions
@@ -20,7 +20,8 @@ from btfref.sampling.fallback import reason_against_surface
 from btfref.sampling.paths import adaptive
 from btfref.sampling.scheduling import run
 from btfref.sampling.settings import ESTIMATORS, SynthesisSettings
-from btfref.sampling.store.layout import remove_leftovers
+from btfref.sampling.store.layout import remove_leftovers, remove_store
+from btfref.sampling.store.lock import writing
 from btfref.sampling.store.resume import resumable
 from btfref.sampling.store.selection import Selection
 from btfref.sampling.store.store import create_store
@@ -169,11 +170,25 @@ class Job:
         **means
             ``memory``, ``scheduler`` and ``workers`` of `btfref.sampling.scheduling.run`.
         """
-        out, settings = Path(out), self.settings
+        with writing(out):
+            return self._filled(Path(out), overwrite, progress, only, report, means)
+
+    def _filled(
+        self,
+        out: Path,
+        overwrite: bool,
+        progress: Progress | None,
+        only: Selection | None,
+        report: Callable[[int], object] | None,
+        means: Facts,
+    ) -> BTFStore:
+        """:meth:`to_store`, while no other process writes there."""
+        settings = self.settings
         remove_leftovers(out)
         store = None
         if out.exists() or out.is_symlink():
             store = resumable(out, self.views, self.lights, self.attributes, overwrite)
+        begun = store is None
         if store is None:
             store = create_store(
                 out,
@@ -185,7 +200,21 @@ class Job:
                 attributes=self.attributes,
                 adaptive=settings.target_error is not None,
             )
-        only = only or Selection()
+        try:
+            peak = self._fill(store, progress, only or Selection(), means)
+        except BtfrefError:
+            # A start that was refused leaves nothing that looks like a beginning.
+            if begun and not store.coverage.any() and not _has_pilot(store):
+                remove_store(out)
+            raise
+        remove_leftovers(out)
+        if report is not None:
+            report(peak)
+        return store
+
+    def _fill(self, store: BTFStore, progress: Progress | None, only: Selection, means: Facts) -> int:
+        """Make what is missing; the largest memory (bytes) of any process that worked."""
+        settings = self.settings
         views, *_ = only.indices(store)
         peak, plan = 0, None
         if settings.target_error is not None:
@@ -216,10 +245,7 @@ class Job:
                 progress(done + now, done + total, label)
 
         used = run(self, store, missing, stage="synthesis", only=only, plan=plan, progress=ahead, **means)
-        remove_leftovers(out)
-        if report is not None:
-            report(max(peak, used))
-        return store
+        return max(peak, used)
 
     def _most(self) -> int:
         """Most samples of a texel, or passes of a view."""
@@ -227,6 +253,13 @@ class Job:
         return (
             max(1, most // adaptive.SURFACE_POINTS) if self.settings.estimator == "surface" else most // 2 * 2
         )
+
+
+def _has_pilot(store: BTFStore) -> bool:
+    """Whether a view's pilot was made."""
+    if store.maps("pilot") is None:
+        return False
+    return any(np.isfinite(store.read_map("pilot", view)[0, 0, 0]) for view in range(len(store.views)))
 
 
 def fingerprint(mesostructure: Mesostructure) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import pickle
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -170,7 +169,9 @@ def _distribute(
 ) -> int:
     """Hand the views out; what a lost worker had not finished goes to another."""
     import distributed
+    from distributed.comm.core import CommClosedError
 
+    _refuse_other_versions(client)
     count = max(1, len(client.nthreads()))
     if job.settings.estimator == "surface":
         # Points and their walks serve all views of a task: as few tasks as there are workers.
@@ -179,7 +180,9 @@ def _distribute(
         size = max(1, len(views) // (count * TASKS_PER_WORKER))
     # Beside the store, where workers must be able to read anyway: what one process holds may be lost with it.
     order = store.path.with_name(f"{store.path.name}.job{DRAFT}")
-    order.write_bytes(pickle.dumps((job, only, plan)))
+    from btfref.sampling.job_file import write_job
+
+    write_job(order, job, only, plan)
     try:
         tasks = [
             client.submit(
@@ -206,23 +209,63 @@ def _distribute(
                 file=store.path,
                 got=str(error).partition("\n")[0],
             ) from None
+        except (distributed.CancelledError, CommClosedError, TimeoutError) as error:
+            raise InputError(
+                "the scheduler is gone; start the same command again to go on",
+                file=store.path,
+                field="scheduler",
+                got=f"{type(error).__name__} {error}".partition("\n")[0],
+            ) from None
         finally:
-            client.cancel(tasks)
+            with contextlib.suppress(Exception):  # a cluster that is gone cannot be told
+                client.cancel(tasks)
         return largest
     finally:
         order.unlink(missing_ok=True)
+
+
+def _refuse_other_versions(client: distributed.Client) -> None:
+    """InputError for a worker of another btfref; those that join later are told by the job's file."""
+    from btfref.provenance import __version__
+
+    try:
+        found = client.run(_version)
+    except (AttributeError, ImportError, ModuleNotFoundError) as error:
+        raise InputError(
+            "a worker of another version", field="btfref", got=f"{error}", expected=__version__
+        ) from None
+    for worker, version in found.items():
+        if version != __version__:
+            raise InputError(
+                f"a worker of another version ({worker})", field="btfref", got=version, expected=__version__
+            )
+
+
+def _version() -> str:
+    """Version of the worker's btfref."""
+    from btfref.provenance import __version__
+
+    return __version__
 
 
 def _work(order: str, path: str, views: list[int], stage: str, settings: _Means) -> tuple[int, int]:
     """What a worker does: fill its views; the number of views and the worker's largest memory."""
     from distributed import get_worker
 
+    from btfref.sampling.job_file import read_job
+
     with _LOCK:
         if not Path(order).is_file():
             raise InputError(
+                "a worker does not see the folder of the store",
+                file=path,
+                expected="the same path everywhere",
+            )
+        job, only, plan = read_job(order)
+        if not Path(path).is_dir():
+            raise InputError(
                 "a worker does not see the store", file=path, expected="the same path everywhere"
             )
-        job, only, plan = pickle.loads(Path(order).read_bytes())
         store = open_store(path)
         _use_threads(job, settings["threads"] or get_worker().state.nthreads)
         memory = default_budget() if settings["memory"] is None else settings["memory"]

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from types import ModuleType
 
 from btfref.errors import InputError
+from btfref.platform import set_variant
 
 
 @contextmanager
@@ -41,7 +42,7 @@ def mitsuba_variant(variant: str) -> Iterator[ModuleType]:
             "Mitsuba variant", field="variant", got=repr(variant), expected=f"one of {', '.join(usable)}"
         )
     previous = mi.variant()
-    mi.set_variant(variant)
+    set_variant(variant)
     try:
         yield mi
     finally:

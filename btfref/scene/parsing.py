@@ -14,9 +14,10 @@ from types import ModuleType
 
 import numpy as np
 
-from btfref.errors import InputError
+from btfref.errors import InputError, refuse_large_picture
 from btfref.numerics.footprint import MODES
 from btfref.numerics.sphere.frames import uv_transform
+from btfref.platform import set_variant
 from btfref.representations.file.container import refuse_store
 from btfref.scene.parameters import check_parameters
 from btfref.scene.shapes import BtfMaterial
@@ -111,7 +112,7 @@ def use_variant(name: str) -> None:
     if name not in mi.variants():
         raise InputError("unknown Mitsuba variant", got=name, expected=", ".join(mi.variants()))
     if mi.variant() != name:
-        mi.set_variant(name)
+        set_variant(name)
 
 
 def scalar_types() -> ModuleType:
@@ -187,6 +188,10 @@ def parse(
         _resolve_file(parsed, node, None if file is None else file.resolve().parent, missing_btf)
         if _is(node, "Film") and size is not None:
             node.props["width"], node.props["height"] = int(size[0]), int(size[1])
+        if _is(node, "Film") and all(name in node.props for name in ("width", "height")):
+            sides = [node.props[name] for name in ("width", "height")]
+            if all(isinstance(side, int) for side in sides):
+                refuse_large_picture((sides[0], sides[1]), "width, height")
     return parsed
 
 

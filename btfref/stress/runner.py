@@ -14,7 +14,7 @@ import numpy as np
 from btfref.conventions import malformed
 from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
-from btfref.registry import method, methods
+from btfref.registry import method, usable_methods
 from btfref.stress import properties
 from btfref.stress.data import DATA, make, scattered
 from btfref.stress.evaluators import DEFINITION, EVALUATORS, MEASURED, Evaluator, evaluator
@@ -70,7 +70,7 @@ def run(
     InputError
         Unknown names.
     """
-    keys = list(methods()) if only is None else [method(key).key for key in only]
+    keys = list(usable_methods()) if only is None else [method(key).key for key in only]
     names = list(DATA) if data is None else list(data)
     for name in names:
         if name not in DATA:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from btfref.errors import InputError
-from btfref.registry import methods
+from btfref.registry import methods, usable_methods
 from btfref.scene.shipped import scene_file
 
 if TYPE_CHECKING:
@@ -168,7 +168,7 @@ def select(
     _known("mesostructure", mesostructures, names())
     for scene in scenes or ():
         scene_file(scene)
-    keys = only or list(methods())
+    keys = only or list(usable_methods())
     materials = mesostructures or (MESOSTRUCTURES[:1] if quick else MESOSTRUCTURES)
     if quick and not scenes and not lights:
         views = list(QUICK_VIEWS)

@@ -8,9 +8,10 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import groupby
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -174,18 +175,23 @@ def default_workers() -> int:
 class _Here:
     """The pool of one worker: this process."""
 
-    def __enter__(self) -> _Here:
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        return None
-
-
-def _pool(workers: int) -> _Here | ProcessPoolExecutor:
+@contextmanager
+def _pool(workers: int) -> Iterator[_Here | ProcessPoolExecutor]:
     if workers == 1:
-        return _Here()
+        yield _Here()
+        return
+    others = set(active_children())
     # Spawned: neither Dr.Jit nor a GL driver survives a fork.
-    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_start_worker)
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_start_worker) as pool:
+        try:
+            yield pool
+        except BaseException:
+            # Nobody waits for what they are at, whatever ends this process.
+            pool.shutdown(wait=False, cancel_futures=True)
+            for child in set(active_children()) - others:
+                child.terminate()
+            raise
 
 
 def _start_worker() -> None:

@@ -1,5 +1,6 @@
 """The same store whoever makes it: one process, few or many Dask workers, workers that are killed, little memory."""
 
+import json
 import os
 import signal
 import subprocess
@@ -121,6 +122,66 @@ def test_a_scheduler_that_is_not_there_is_one_line(tmp_path, capsys):
     out = str(tmp_path / "a.btf.zarr")
     assert main(["synth", "flat", "-o", out, "--scheduler", "nowhere", "--texels", "2"]) == 2
     assert "scheduler" in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_a_scheduler_that_dies_is_one_line_and_the_run_goes_on(tmp_path, need):
+    """What was made before stays; the same command without it ends with the same bytes."""
+    need("distributed")
+    root = str(Path(__file__).parents[2])
+    environment = os.environ | {"PYTHONPATH": root}
+    where = tmp_path / "scheduler.json"
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment}
+    base = [sys.executable, "-m", "distributed.cli"]
+    scheduler = subprocess.Popen(
+        [
+            *base[:2],
+            f"{base[2]}.dask_scheduler",
+            "--port",
+            "0",
+            "--no-dashboard",
+            "--scheduler-file",
+            str(where),
+        ],
+        **quiet,
+    )
+    worker = subprocess.Popen(
+        [*base[:2], f"{base[2]}.dask_worker", "--nthreads", "1", "--scheduler-file", str(where)], **quiet
+    )
+    out, alone = tmp_path / "a.btf.zarr", tmp_path / "alone.btf.zarr"
+    settings = [
+        "--texels",
+        "32",
+        "--views",
+        "3x4",
+        "--lights",
+        "2x4",
+        "--spp",
+        "256",
+        "--set",
+        "resolution=16",
+    ]
+    command = [sys.executable, "-m", "btfref", "synth", "checker", *settings, "-o"]
+    try:
+        while not where.exists():
+            assert scheduler.poll() is None
+        address = json.loads(where.read_text())["address"]
+        run = subprocess.Popen(
+            [*command, str(out), "--scheduler", address], stderr=subprocess.PIPE, env=environment
+        )
+        while not (out.exists() and open_store(out).coverage.any()):
+            assert run.poll() is None
+        scheduler.kill()
+        _, said = run.communicate(timeout=200)
+    finally:
+        for process in (scheduler, worker):
+            process.kill()
+            process.wait()
+    assert (run.returncode, said.count(b"\n")) == (2, 1), said
+    assert b"scheduler" in said
+    for path in (out, alone):
+        subprocess.run([*command, str(path)], env=environment, check=True, stdout=subprocess.DEVNULL)
+    assert contents(out) == contents(alone)
 
 
 # --- memory

@@ -11,17 +11,18 @@ from importlib import import_module
 from typing import Any
 
 from btfref.commands.shared.options import WIDTH, entries
-from btfref.registry import Method, methods
+from btfref.registry import Method, broken_points, methods
 
 #: How a docstring says that another one describes a parameter.
 _ELSEWHERE = re.compile(r"[Ss]ee :\w+:`~?([\w.]+)`")
 
 
 def methods_help() -> list[str]:
-    """All methods, those of installed packages too."""
+    """All methods, those of installed packages too, and packages whose methods cannot be had."""
     return [
         "methods (btfref fit METHOD --help: the parameters of one):",
         *entries({key: f"{row.title}; {row.paper}" for key, row in methods().items()}),
+        *(f"  {point}" for point in broken_points()),
         "",
     ]
 

@@ -6,6 +6,7 @@ import textwrap
 from argparse import ArgumentParser, _ActionsContainer
 
 from btfref.commands.shared.reading import count, size
+from btfref.errors import GRID, SEED
 from btfref.sampling.settings import DTYPES
 from btfref.scene.shipped import ENVIRONMENTS, described, lights, names
 
@@ -28,7 +29,15 @@ def add_image(parser: _ActionsContainer) -> None:
     """Where an image goes, and how large it is."""
     parser.add_argument("-o", "--output", required=True, metavar="X.exr", help="the image to write")
     parser.add_argument("--png", action="store_true", help="also write X.png, for eyes")
+    add_overwrite(parser)
     add_size(parser)
+
+
+def add_overwrite(parser: _ActionsContainer) -> None:
+    """``--overwrite``: an output may take the place of a file of another kind."""
+    parser.add_argument(
+        "--overwrite", action="store_true", help="replace a file of another kind that has the output's name"
+    )
 
 
 def add_size(parser: _ActionsContainer, text: str = "of the image, in pixels (default: the scene's)") -> None:
@@ -40,7 +49,7 @@ def add_grid(
     parser: _ActionsContainer, *, default: int | None = 4, text: str = "N × N sub-pixels (default 4)"
 ) -> None:
     """``--grid N``: the regular grid of samples in each pixel."""
-    parser.add_argument("--grid", type=count(1), default=default, metavar="N", help=text)
+    parser.add_argument("--grid", type=count(1, GRID), default=default, metavar="N", help=text)
 
 
 def add_keep(parser: _ActionsContainer) -> None:
@@ -66,7 +75,7 @@ def words(text: str | None) -> list[str] | None:
 def add_seed(parser: _ActionsContainer) -> None:
     """``--seed N``."""
     parser.add_argument(
-        "--seed", type=count(0), default=0, metavar="N", help="of all random numbers (default 0)"
+        "--seed", type=count(0, SEED), default=0, metavar="N", help="of all random numbers (default 0)"
     )
 
 

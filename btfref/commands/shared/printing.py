@@ -3,26 +3,53 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
+import tempfile
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from btfref.errors import BtfrefError
 
 if TYPE_CHECKING:
     from btfref.gates import GateResult
     from btfref.representations.protocol import Representation
 
 
-def emit(text: str = "", *, flush: bool = False) -> None:
-    """Write one line to standard output; `flush` before work that takes long or writes by itself."""
-    sys.stdout.write(f"{text}\n")
+#: Characters that a terminal obeys instead of showing: controls but for the line's end and the tab, marks that turn
+#: the direction of what follows.
+_CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+
+
+def printable(text: str) -> str:
+    """Text whose control characters are written out as escapes: names and attributes come from files."""
+    return _CONTROLS.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
+def emit(text: str = "", *, flush: bool = False, coloured: bool = False) -> None:
+    """Write lines to standard output.
+
+    Parameters
+    ----------
+    text : str
+    flush : bool
+        Before work that takes long or writes by itself.
+    coloured : bool
+        Whether the text has colours of ours; its parts then went through `printable`.
+    """
+    sys.stdout.write(f"{text if coloured else printable(text)}\n")
     if flush:
         sys.stdout.flush()
 
 
 def emit_json(data: object) -> None:
     """Write `data` to standard output as indented JSON."""
-    emit(json.dumps(data, indent=2, ensure_ascii=False, default=_plain))
+    utf8 = (getattr(sys.stdout, "encoding", None) or "utf-8").lower().replace("-", "") == "utf8"
+    text = json.dumps(data, indent=2, ensure_ascii=not utf8, default=_plain)
+    # Controls that JSON leaves as they are stand in strings alone.
+    emit(_CONTROLS.sub(lambda found: f"\\u{ord(found[0]):04x}" if found[0] != "\r" else found[0], text))
 
 
 def _plain(value: Any) -> object:
@@ -105,12 +132,38 @@ def write_representation(representation: Representation, out: Path, *, json: boo
     """Write a representation's file and say what is in it, as one line or as JSON."""
     from btfref.representations.file.container import read_info, save
 
-    save(representation, out)
+    try:
+        save(representation, out)
+    except OSError as error:
+        place = _elsewhere(representation, out)
+        if place is None:
+            raise
+        raise BtfrefError(
+            f"{out}: {error.strerror}; what was made is in {place}, move it from there"
+        ) from error
     info = read_info(out)
     if json:
         emit_json(info)
     else:
         emit(f"{out}: {info['method']}, maps {bytes_text(info['payload_bytes'])}, 1:{info['ratio']:.3g}")
+
+
+def _elsewhere(representation: Representation, out: Path) -> Path | None:
+    """Where a representation was written that its own place would not take: it may have taken hours to make."""
+    from btfref.representations.file.container import save
+
+    for folder in (Path(tempfile.gettempdir()), Path.cwd(), Path.home()):
+        if folder.resolve() == out.absolute().parent.resolve():
+            continue
+        with suppress(OSError, BtfrefError):
+            place = Path(tempfile.mkdtemp(prefix="btfref-", dir=folder))
+            try:
+                save(representation, place / out.name)
+            except BaseException:
+                place.rmdir()
+                raise
+            return place / out.name
+    return None
 
 
 #: What :func:`gate_cells` gives, as the head of a table.

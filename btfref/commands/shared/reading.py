@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from argparse import ArgumentTypeError
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from btfref.errors import InputError
+from btfref.errors import COUNT, INDICES, PIXELS, InputError, Limit
 from btfref.types import PathLike
 
 if TYPE_CHECKING:
@@ -48,13 +49,16 @@ def assignments(
 def size(text: str) -> tuple[int, int]:
     """``WxH`` as ``(width, height)`` in pixels, for argparse's ``type=``."""
     width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-        raise ArgumentTypeError(f"got {text!r}, expected WxH in pixels, e.g. 640x480")
+    digits = [side.lstrip("0") for side in (width, height)]
+    if not all(side.isascii() and side.isdecimal() for side in digits):
+        raise ArgumentTypeError(f"got {text[:40]!r}, expected WxH in pixels, e.g. 640x480")
+    if max(map(len, digits)) > len(str(PIXELS.most)) or int(digits[0]) * int(digits[1]) > PIXELS.most:
+        raise ArgumentTypeError(f"got {text[:40]}, expected pixels of {PIXELS}")
     return int(width), int(height)
 
 
-def count(minimum: int = 1) -> Callable[[str], int]:
-    """A reader of integers of at least `minimum`, for argparse's ``type=``."""
+def count(minimum: int = 1, limit: Limit = COUNT) -> Callable[[str], int]:
+    """A reader of integers of at least `minimum` and within a limit, for argparse's ``type=``."""
 
     def read(text: str) -> int:
         try:
@@ -62,7 +66,9 @@ def count(minimum: int = 1) -> Callable[[str], int]:
         except ValueError:
             number = None
         if number is None or number < minimum:
-            raise ArgumentTypeError(f"got {text!r}, expected an integer ≥ {minimum}")
+            raise ArgumentTypeError(f"got {text[:40]!r}, expected an integer ≥ {minimum}")
+        if number > limit.most:
+            raise ArgumentTypeError(f"got {text[:40]}, expected {limit}")
         return number
 
     return read
@@ -89,14 +95,19 @@ def ranges(text: str) -> tuple[int, ...]:
     for item in text.split(","):
         first, dash, last = item.partition("-")
         if not first.isdecimal() or (dash and not last.isdecimal()):
-            raise ArgumentTypeError(f"got {text!r}, expected numbers and ranges such as 0,3,10-12")
+            raise ArgumentTypeError(f"got {text[:40]!r}, expected numbers and ranges such as 0,3,10-12")
+        # Digits first: reading a number of thousands of them is refused by Python itself.
+        if max(len(first), len(last)) > len(str(INDICES.most)) or int(last or first) > INDICES.most:
+            raise ArgumentTypeError(f"got {item[:40]}, expected indices of {INDICES}")
         found.extend(range(int(first), int(last if dash else first) + 1))
+        if len(found) > INDICES.most + 1:
+            raise ArgumentTypeError(f"got more than {INDICES.most} numbers, expected {INDICES}")
     return tuple(found)
 
 
 def memory_size(text: str) -> int:
     """An amount of memory such as ``2G``, ``800MiB`` in bytes, for argparse's ``type=``."""
-    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([kMGT]?)(?:i?B)?", text)
+    found = re.fullmatch(r"(\d{1,18}(?:\.\d{1,18})?)\s*([kMGT]?)(?:i?B)?", text, re.ASCII)
     if found is None or not float(found[1]):
         raise ArgumentTypeError(f"got {text!r}, expected an amount such as 800M or 2G")
     return int(float(found[1]) * 1024 ** " kMGT".index(found[2] or " "))
@@ -121,6 +132,8 @@ def direction_set(text: str) -> str | np.ndarray:
     """
     if not text.endswith((".txt", ".csv")):
         return text
+    if Path(text).exists() and not Path(text).is_file():
+        raise InputError("cannot read directions", file=text, got="no file", expected="theta phi per line")
     import numpy as np
 
     try:
@@ -153,4 +166,6 @@ def output_file(text: PathLike, *suffixes: str) -> Path:
         )
     if not path.parent.is_dir():
         raise InputError("cannot write there", file=text, got="no such folder")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise InputError("cannot write there", file=text, got="a place that is read-only for you")
     return path

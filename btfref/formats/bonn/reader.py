@@ -5,7 +5,6 @@ Values are f, or f · cos θ_light where the cosine flag is set; colours are lin
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
@@ -80,9 +79,7 @@ def open_bonn(path: PathLike) -> Source:
             **header.facts,
             **values.facts,
         },
-        fingerprint=hashlib.sha256(
-            b"".join((reader.map[: 1 << 20], reader.map[-4096:], str(reader.size).encode()))
-        ).hexdigest()[:32],
+        fingerprint=reader.digest,
     )
     if isinstance(values, BDI):
         values.source = source  # which says how much memory there is

@@ -86,11 +86,15 @@ class _Files:
     sizes: dict[str, int]
 
     def fingerprint(self) -> str:
-        """Digest of names and sizes."""
+        """Digest of names, sizes and contents."""
         state = hashlib.sha256()
         for name, size in sorted(self.sizes.items()):
-            state.update(f"{name}\0{size}\n".encode("utf-8", "surrogateescape"))
+            state.update(f"{name}\0{size}\0{self.content(name)}\n".encode("utf-8", "surrogateescape"))
         return state.hexdigest()[:32]
+
+    def content(self, name: str) -> str:
+        """Digest of the bytes of a file."""
+        raise NotImplementedError
 
     def images(self) -> list[str]:
         """Names that end as pictures do."""
@@ -114,6 +118,14 @@ class Folder(_Files):
     def where(self, name: str) -> Path:
         """Path of a file, for errors."""
         return self.path / name
+
+    def content(self, name: str) -> str:
+        """Digest of the bytes of a file."""
+        try:
+            with self.where(name).open("rb") as stream:
+                return hashlib.file_digest(stream, "sha256").hexdigest()
+        except FileNotFoundError:
+            raise InputError("the file has gone", file=self.where(name)) from None
 
     def read(self, name: str) -> bytes:
         """Bytes of a file."""
@@ -180,6 +192,10 @@ class Archive(_Files):
     def where(self, name: str) -> str:
         """Path of a file, for errors."""
         return f"{self.path}/{name}"
+
+    def content(self, name: str) -> str:
+        """The checksum that the archive has of a file."""
+        return f"{self._entries[name].CRC:08x}"
 
     def read(self, name: str) -> bytes:
         """Bytes of a file; never more than the directory promised."""

@@ -101,7 +101,7 @@ def image_source(
         },
         present=found.present,
         moved=found.moved,
-        fingerprint=files.fingerprint(),
+        fingerprint=files.fingerprint,
     )
 
 

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from btfref.errors import InputError
+from btfref.errors import DIRECTIONS, InputError, refuse_above
 from btfref.numerics.sphere import interpolation
 from btfref.numerics.sphere.quadrature import hemisphere_weights
 from btfref.types import PathLike
@@ -145,10 +145,11 @@ def directions(spec: str | DirectionSet | ArrayLike) -> DirectionSet:
         if grid is None:
             raise InputError(
                 "unknown set of directions",
-                got=repr(spec),
+                got=repr(spec[:40]),
                 expected=f"{', '.join(NAMED_RINGS)} or a grid such as 10x5",
             )
         n_theta, n_phi = map(int, grid.groups())
+        refuse_above(DIRECTIONS, n_theta * n_phi, "directions")
         rings = [((i + 0.5) * 90 / n_theta, n_phi, 0) for i in range(n_theta)]
         return checked(ring_directions(rings), spec)
     return checked(np.asarray(spec, float), "custom")
@@ -160,6 +161,7 @@ def checked(vectors: np.ndarray, name: str, *, file: PathLike | None = None) -> 
         raise InputError(
             "directions have the wrong shape", file=file, got=vectors.shape, expected="(n, 3) with n ≥ 1"
         )
+    refuse_above(DIRECTIONS, len(vectors), "directions")
     if not np.isfinite(vectors).all():
         raise InputError("directions hold a value that is not finite", file=file)
     length = np.linalg.norm(vectors, axis=1)

@@ -50,9 +50,9 @@ def shared_tables(
         For a method without tables that texels share.
     """
     if not isinstance(representation, lit_by):
-        from btfref.registry import methods
+        from btfref.registry import representations
 
-        having = [key for key, row in methods().items() if isinstance(row.representation, lit_by)]
+        having = [key for key, made in representations().items() if isinstance(made, lit_by)]
         raise InputError(
             "spherical harmonics need tables over lights that texels share",
             file=file,

@@ -70,13 +70,19 @@ class TransferSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, least in (("clusters", 1), ("components", 1), ("bounces", 0), ("map_size", 2)):
-            if not isinstance(getattr(self, name), int) or getattr(self, name) < least:
+        for name, least, most in (
+            ("clusters", 1, 4096),
+            ("components", 1, 256),
+            ("bounces", 0, 64),
+            ("map_size", 2, 256),
+        ):
+            value = getattr(self, name)
+            if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
                 raise InputError(
                     "a setting of the transfer is out of range",
                     field=name,
                     got=getattr(self, name),
-                    expected=f"a whole number ≥ {least}",
+                    expected=f"a whole number in [{least}, {most}]",
                 )
         if self.bits not in (8, 32):
             raise InputError(

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from btfref import representations
-from btfref.errors import BtfrefError, InputError
+from btfref.errors import GRID, BtfrefError, InputError, refuse_above
 from btfref.rendering import RenderResult
 from btfref.rendering.environment_light.lighting import lighting_of
 from btfref.rendering.gl import device
@@ -109,6 +109,7 @@ def realtime(
     """
     if grid < 1:
         raise InputError("the sub-pixel grid needs a sample", field="grid", got=grid, expected="≥ 1")
+    refuse_above(GRID, grid, "grid")
     if keep != "all" and isinstance(scene, SceneDescription):
         raise InputError("the maps that are needed follow from a scene file", field="keep", got=keep)
     needed: Kept = {}

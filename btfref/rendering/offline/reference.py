@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from btfref.errors import BtfrefError, InputError
+from btfref.errors import GRID, SAMPLES, BtfrefError, InputError, refuse_above
 from btfref.rendering import RenderResult
 from btfref.rendering.offline.direct_light import make_integrator, on_grid
 from btfref.sampling.variant import no_collection
@@ -19,6 +19,9 @@ from btfref.types import Facts, JitArray, SceneLike
 
 #: Independent renders whose spread gives the variance of the mean: 15 degrees of freedom.
 BATCHES = 16
+
+#: Samples of a picture that are traced together: some 100 bytes each.
+LANES = 1 << 27
 
 
 def render(
@@ -83,9 +86,10 @@ def render(
     MissingDependencyError
         Without a usable LLVM for an llvm variant.
     """
-    for name, value in (("spp", spp), ("grid", grid)):
+    for name, value, limit in (("spp", spp, SAMPLES), ("grid", grid, GRID)):
         if value is not None and value < 1:
             raise InputError("at least one sample is needed", field=name, got=value, expected="≥ 1")
+        refuse_above(limit, value or 0, name)
     # Without a grid rays are random: views are found with a wide margin, and light may come from anywhere.
     margin = MARGIN if grid else None
     kept = kept_maps(
@@ -162,7 +166,21 @@ def _monte_carlo(scene: JitArray, spp: int, seed: int, with_variance: bool, shad
         "shadows": shadows,
     }
 
+    width, height = (int(n) for n in scene.sensors()[0].film().size())
+    together = LANES // (width * height) or 1
+
     def once(count: int, number: int) -> np.ndarray:
+        if count * width * height <= LANES:
+            return made_once(count, number)
+        # More than memory holds at a time: the mean of several pictures.
+        parts = [min(together, count - first) for first in range(0, count, together)]
+        seeds = np.random.SeedSequence([number, len(parts)]).generate_state(len(parts))
+        total = np.zeros((height, width, 3))
+        for part, word in zip(parts, seeds, strict=True):
+            total += part * made_once(part, int(word)).astype(float)
+        return (total / count).astype(np.float32)
+
+    def made_once(count: int, number: int) -> np.ndarray:
         return np.array(mi.render(scene, integrator=integrator, spp=count, seed=number), np.float32)[..., :3]
 
     if not with_variance:

@@ -20,10 +20,11 @@ from btfref.numerics.solvers.levenberg import BatchFit, fit_batch
 from btfref.precision import real
 from btfref.representations.analytic import light_functions
 from btfref.representations.analytic.lobe_start import exponent_limit
+from btfref.representations.file.schema import LARGEST, MapSchema, Number, Range, Schema
 from btfref.representations.lookup import positive_integer, stored
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Collection
     from types import ModuleType
 
     from numpy.typing import ArrayLike
@@ -55,6 +56,11 @@ class Representation(light_functions.AnalyticMaps):
     ``colour`` [row, column, 4]: chroma and ρ_d in 1/sr; and the direction tables.
     """  # noqa: D205
 
+    @classmethod
+    def schema(cls, meta: Facts, names: Collection[str]) -> Schema:
+        """What its files hold; see :class:`btfref.representations.protocol.HasSchema`."""
+        return lobe_schema()
+
     def evaluate(
         self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
     ) -> np.ndarray:
@@ -70,6 +76,20 @@ class Representation(light_functions.AnalyticMaps):
     def luminance_tables(self, texels: np.ndarray, views: np.ndarray) -> np.ndarray:
         """Model of luminance at measured views and all measured lights, shape (n, n_views, n_lights)."""
         return luminance_tables(self.maps, texels, views)
+
+
+def lobe_schema(**maps: MapSchema) -> Schema:
+    """Maps of lobes, and further ones; see :class:`btfref.representations.protocol.HasSchema`."""
+    # Coefficients beyond 1 would make powers that overflow.
+    unit, exponent = Range(-1, 1), Range(0, LARGEST)
+    own = {
+        "lobes": MapSchema(
+            "rows columns 4*lobes", parts={(0, 4): unit, (1, 4): unit, (2, 4): unit, (3, 4): exponent}
+        ),
+        "peaks": MapSchema("rows columns lobes", least=0),
+        "colour": MapSchema("rows columns 4"),
+    }
+    return Schema(own | maps, light_functions.EDGES | {"n_lobes": Number("lobes")})
 
 
 def flat_maps(maps: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -12,15 +12,18 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from btfref.representations.analytic import lafortune, light_functions
+from btfref.representations.file.schema import MapSchema, Schema
 from btfref.representations.lookup import positive_integer
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from numpy.typing import ArrayLike
 
     from btfref.numerics.solvers.levenberg import BatchFit
     from btfref.representations.analytic.light_functions import HeldStencils
     from btfref.sampling.sampled_btf import SampledBTF
-    from btfref.types import Progress
+    from btfref.types import Facts, Progress
 
 
 #: "paper": Table 1's four lobes, in floats.
@@ -35,6 +38,11 @@ class Representation(light_functions.AnalyticMaps):
 
     #: Maps by view; see :mod:`btfref.representations.file.resident`.
     DIRECTION_AXES: ClassVar = {"view": {"factor": 2}}
+
+    @classmethod
+    def schema(cls, meta: Facts, names: Collection[str]) -> Schema:
+        """What its files hold; see :class:`btfref.representations.protocol.HasSchema`."""
+        return lafortune.lobe_schema(factor=MapSchema("rows columns views", least=0, most=FACTOR_BOUND))
 
     def evaluate(
         self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0

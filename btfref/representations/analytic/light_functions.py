@@ -17,6 +17,7 @@ import numpy as np
 from btfref import conventions
 from btfref.numerics.sphere import interpolation
 from btfref.precision import real
+from btfref.representations.file.schema import Constant, Edge
 from btfref.representations.guide import feature_views, texel_groups
 from btfref.representations.lookup import (
     StoredMaps,
@@ -40,6 +41,9 @@ M = TypeVar("M", bound="AnalyticMaps")
 
 #: Texels fitted at a time: bounds the memory of luminance tables and of normal equations.
 BLOCK = 4096
+
+#: Constants that :func:`edge_constants` makes.
+EDGES: dict[str, Constant] = {"light_edge": Edge("light"), "view_edge": Edge("view")}
 
 #: Members of a group of texels whose mean guides importance sampling.
 GUIDE_MEMBERS = 16

@@ -26,9 +26,11 @@ from btfref.representations.analytic.lobe_start import (
     lobe_starts,
     tilted_starts,
 )
+from btfref.representations.file.schema import LARGEST, MapSchema, Number, Range, Schema
 from btfref.representations.lookup import positive_integer, stored
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
     from types import ModuleType
 
     from numpy.typing import ArrayLike
@@ -46,6 +48,9 @@ PRESETS = {"paper": {"lobes": 2, "storage": "float"}}
 #: Parabolic coordinates of a lobe's axis stay within ± this: axes may dip below the horizon, where raised structure
 #: keeps brightening towards grazing light, but not reach the pole of the map.
 AXIS_BOUND = 1.5
+
+#: Parabolic coordinates that a file may hold: their squares stay within float32.
+LARGEST_AXIS = 1e6
 
 #: Least exponent: below 1 a lobe's slope is infinite where it ends, and no interpolation of rounded numbers agrees.
 LEAST_EXPONENT = 1.0
@@ -74,6 +79,17 @@ class Representation(light_functions.AnalyticMaps):
     #: Maps by view; see :mod:`btfref.representations.file.resident`.
     DIRECTION_AXES: ClassVar = {"view": {"lobes": 2}}
     ROWS_BY: ClassVar = {"lobes": (2,)}
+
+    @classmethod
+    def schema(cls, meta: Facts, names: Collection[str]) -> Schema:
+        """What its files hold; see :class:`btfref.representations.protocol.HasSchema`."""
+        axis, positive = Range(-LARGEST_AXIS, LARGEST_AXIS), Range(0, LARGEST)
+        parts = {(0, 4): axis, (1, 4): axis, (2, 4): positive, (3, 4): positive}
+        maps = {
+            "lobes": MapSchema("rows columns views 4*lobes", parts=parts),
+            "colour": MapSchema("rows columns 4"),
+        }
+        return Schema(maps, light_functions.EDGES | {"n_lobes": Number("lobes")})
 
     def evaluate(
         self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0

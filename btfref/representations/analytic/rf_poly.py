@@ -17,9 +17,12 @@ import numpy as np
 
 from btfref.precision import real
 from btfref.representations.analytic import light_functions
+from btfref.representations.file.schema import MapSchema, Schema
 from btfref.representations.lookup import stored
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from numpy.typing import ArrayLike
 
     from btfref.representations.analytic.light_functions import HeldStencils
@@ -47,6 +50,15 @@ class Representation(light_functions.AnalyticMaps):
     #: Maps by view; see :mod:`btfref.representations.file.resident`.
     DIRECTION_AXES: ClassVar = {"view": {"polynomial": 2}}
     ROWS_BY: ClassVar = {"polynomial": (2,)}
+
+    @classmethod
+    def schema(cls, meta: Facts, names: Collection[str]) -> Schema:
+        """What its files hold; see :class:`btfref.representations.protocol.HasSchema`."""
+        maps = {
+            "polynomial": MapSchema("rows columns views 6"),
+            "chroma": MapSchema("rows columns 3"),
+        }
+        return Schema(maps, light_functions.EDGES)
 
     def evaluate(
         self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0

@@ -15,14 +15,28 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from btfref import conventions
+from btfref.errors import InputError
 from btfref.numerics.solvers.factoring import map_operators
 from btfref.numerics.sphere.halfway import half_difference
 from btfref.numerics.sphere.parabolic import bilinear_stencil
 from btfref.precision import precision, real
+from btfref.representations.file.schema import (
+    CODES,
+    FLOATS,
+    INDICES,
+    Constant,
+    Edge,
+    MapSchema,
+    OneOf,
+    Range,
+    Schema,
+)
 from btfref.representations.guide import feature_views, group_means, spread_members, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from numpy.typing import ArrayLike, DTypeLike
 
     from btfref.numerics.solvers.factoring import FactorOperators
@@ -31,6 +45,9 @@ if TYPE_CHECKING:
 
 #: Factors in the order of the index map's channels; with one term each and no D these are the paper's r, g and b.
 FACTORS = ("p", "q", "r", "d")
+
+#: Terms of a product that a file may have.
+MOST_TERMS = 64
 
 #: Members of a group of texels from which its mean for importance sampling is taken.
 GUIDE_MEMBERS = 16
@@ -45,6 +62,29 @@ class Representation(StoredMaps):
     than one term of Q · D. uint8 maps hold 255 times their numbers. The constants ``map_power`` and ``scale_power``
     are 1 or 4: what the numbers in the maps, and in the map of scales, are raised to.
     """
+
+    @classmethod
+    def schema(cls, meta: Facts, names: Collection[str]) -> Schema:
+        """What its files hold; see :class:`btfref.representations.protocol.HasSchema`."""
+        terms, half_terms = (_count_of_terms(meta, name) for name in ("n_terms", "n_half_terms"))
+        factors = FACTORS if "factor_d" in names else FACTORS[:3]
+        counts = dict(zip(FACTORS, (terms, half_terms, terms, half_terms), strict=True))
+        channels = tuple(f"factor_{name}" for name in factors for _ in range(counts[name]))
+        maps = {f"factor_{name}": _codes(f"prototypes_{name} side side 3") for name in factors}
+        maps["index"] = MapSchema(f"rows columns {len(channels)}", INDICES, below=channels)
+        maps["scale_map"] = _codes(f"rows columns {terms} 3")
+        maps["scale_peak"] = MapSchema(f"{terms} 3", FLOATS, least=0)
+        if half_terms > 1:
+            maps["half_scale"] = _codes(f"rows columns {half_terms} 3")
+        powers = OneOf((1, 4))
+        constants: dict[str, Constant] = {
+            "n_terms": OneOf((terms,)),
+            "n_half_terms": OneOf((half_terms,)),
+            "light_cos_last": Edge("light", floor=-1.0),
+            "map_power": powers,
+            "scale_power": powers,
+        }
+        return Schema(maps, constants)
 
     def evaluate(
         self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
@@ -156,6 +196,22 @@ class Representation(StoredMaps):
             ]
         )
         return labels.reshape(self.meta["texels"]), group_means(labels[members], tables)
+
+
+def _codes(axes: str) -> MapSchema:
+    """A map of numbers in [0, 1] in any storage."""
+    return MapSchema(axes, CODES, least=0, most=1)
+
+
+def _count_of_terms(meta: Facts, name: str) -> int:
+    """A number of terms, from the constants of a file."""
+    found = meta["constants"].get(name)
+    if type(found) is not int or not 1 <= found <= MOST_TERMS:
+        expected = Range(1, MOST_TERMS, whole=True)
+        raise InputError(
+            "a constant is out of range", field=f"constants.{name}", got=found, expected=expected
+        )
+    return found
 
 
 def index_slots(constants: Facts) -> dict[str, slice]:

@@ -8,7 +8,6 @@ back to it.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,18 +15,30 @@ import numpy as np
 
 from btfref.conventions import SCHEMA_VERSION
 from btfref.errors import InputError
+from btfref.images.openexr import opened, write
 from btfref.outputs import new_file
 from btfref.registry import method
+from btfref.representations.file.manifest import (
+    KIND_OF_CHECKSUM,
+    TYPES,
+    check_parts,
+    checksums,
+    image_of_entry,
+    parsed,
+    refuse_changed,
+    stored_type,
+    text_of,
+)
 from btfref.representations.file.map_images import (
     channel_names,
     file_shape,
     image_of,
-    image_size,
     leading_axes,
     rows_of,
 )
 from btfref.representations.file.resident import needed_rows, select
 from btfref.representations.file.rows import RowReader
+from btfref.representations.file.validator import check_layout, check_values
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -38,12 +49,10 @@ if TYPE_CHECKING:
     from btfref.types import Facts, PathLike
 
 
-ATTRIBUTE = "btfref"
 #: Share of a file's bytes up to which reading its rows one by one is faster than the whole by OpenEXR: the former
 #: takes 2.2 to 2.8 times as long a byte.
 WORTH = 0.35
 _MAGIC = bytes((0x76, 0x2F, 0x31, 0x01))
-_TYPES = ("float16", "float32", "uint32", "uint8")
 
 
 def save(representation: Representation, path: PathLike) -> None:
@@ -74,7 +83,9 @@ def save(representation: Representation, path: PathLike) -> None:
     for name, axes in rows_by.items():
         if axes:
             manifest["arrays"][name]["rows"] = axes
-    images = {name: image_of(array, rows_by[name]) for name, array in arrays.items()}
+    images = {name: _stored_image(name, array, rows_by[name]) for name, array in arrays.items()}
+    for name, image in images.items():
+        manifest["arrays"][name][KIND_OF_CHECKSUM] = checksums(image)
     display = (
         np.zeros(2, np.int32),
         np.array(
@@ -84,10 +95,6 @@ def save(representation: Representation, path: PathLike) -> None:
     )
     parts: list[OpenEXR.Part] = []
     for name, image in images.items():
-        if image.dtype.name not in _TYPES:
-            raise TypeError(f"map {name} must be one of {_TYPES}, got {image.dtype}")
-        if image.dtype == np.uint8:
-            image = (image / 255).astype(np.float16)
         header = {
             "name": name,
             "type": OpenEXR.scanlineimage,
@@ -99,14 +106,22 @@ def save(representation: Representation, path: PathLike) -> None:
             ),
         }
         if not parts:
-            header[ATTRIBUTE] = json.dumps(manifest, sort_keys=True)
+            header |= text_of(manifest)
         channels = {
             channel: np.ascontiguousarray(image[..., i])
             for i, channel in enumerate(channel_names(image.shape[-1]))
         }
         parts.append(OpenEXR.Part(header, channels, name))
     with new_file(path) as draft:
-        OpenEXR.File(parts).write(str(draft))
+        write(parts, draft)
+
+
+def _stored_image(name: str, array: np.ndarray, leading: Sequence[int]) -> np.ndarray:
+    """A map as the image that stands in the file."""
+    if array.dtype.name not in TYPES:
+        raise TypeError(f"map {name} must be one of {TYPES}, got {array.dtype}")
+    image = image_of(array, leading)
+    return (image / 255).astype(np.float16) if image.dtype == np.uint8 else image
 
 
 def load(
@@ -140,21 +155,14 @@ def load(
     """
     choice = {"views": views, "lights": lights, "entries": entries, "levels": levels}
     chosen = any(indices is not None for indices in choice.values())
-    arrays = None
-    if chosen:
-        manifest, _ = _open(path, header_only=True)
-        arrays = _read_some(path, manifest, choice)
+    manifest, reader = _opened(path)
+    with reader:
+        arrays = _read_some(reader, manifest, choice) if chosen else None
     if arrays is None:
-        manifest, parts = _open(path, header_only=False)
-        arrays = {}
-        for name, entry in manifest["arrays"].items():
-            if name not in parts:
-                raise InputError("a map is missing", file=path, field=name)
-            arrays[name] = _read_map(
-                path, name, entry, _channels_of(path, name, entry, parts[name]), manifest
-            )
+        arrays = _whole_file(path, manifest)
     meta = manifest["meta"]
     kind = method(meta["method"], file=path).representation
+    check_values(arrays, manifest, kind, path)
     arrays, meta = select(arrays, meta, kind, **choice, file=path)
     return kind.from_arrays(arrays, meta)
 
@@ -178,15 +186,16 @@ def read_maps(path: PathLike, wanted: Callable[[str], bool]) -> tuple[dict[str, 
     InputError
         As for :func:`load`.
     """
-    manifest, _ = _open(path, header_only=True)
+    manifest, reader = _opened(path)
     arrays = {}
-    with RowReader(path) as reader:
+    with reader:
         for name, entry in manifest["arrays"].items():
             if wanted(name):
                 if not reader.knows(name):
                     raise InputError("a map is missing or compressed in another way", file=path, field=name)
                 pixels = reader.read(name, channel_names(entry["shape"][-1]))
                 arrays[name] = _read_map(path, name, entry, pixels, manifest)
+    check_values(arrays, manifest, method(manifest["meta"]["method"], file=path).representation, path)
     return arrays, manifest["meta"]
 
 
@@ -203,19 +212,17 @@ def bytes_of_choice(path: PathLike, choice: Mapping[str, ArrayLike | None]) -> i
     -------
     int
     """
-    manifest, _ = _open(path, header_only=True)
-    found: list[int] = []
-    _read_some(path, manifest, choice, found)
-    return found[0] if found else Path(path).stat().st_size
+    manifest, reader = _opened(path)
+    with reader:
+        read = _read_some(reader, manifest, choice)
+        return Path(path).stat().st_size if read is None else reader.bytes_read
 
 
 def _read_some(
-    path: PathLike,
-    manifest: Facts,
-    choice: Mapping[str, ArrayLike | None],
-    bytes_read: list[int] | None = None,
+    reader: RowReader, manifest: Facts, choice: Mapping[str, ArrayLike | None]
 ) -> dict[str, np.ndarray] | None:
     """The maps with the rows that a choice needs, or None where reading the whole file takes no longer."""
+    path = reader.path
     kind = method(manifest["meta"]["method"], file=path).representation
     sizes = {
         name: int(np.prod(entry["shape"], dtype=np.int64)) * np.dtype(entry["dtype"]).itemsize
@@ -223,21 +230,17 @@ def _read_some(
     }
     wanted = needed_rows(kind, manifest, choice)
     plans = {name: rows_of(manifest["arrays"][name], axes) for name, axes in wanted.items()}
-    # Rows alone may settle it, before the file's headers are read.
     if sum(sizes[name] for name, rows in plans.items() if rows is None) > WORTH * sum(sizes.values()):
         return None
+    if not all(reader.knows(name) for name in plans):
+        return None
+    if sum(sizes[name] * reader.share(name, plans[name]) for name in plans) > WORTH * sum(sizes.values()):
+        return None
     arrays = {}
-    with RowReader(path) as reader:
-        if not all(reader.knows(name) for name in plans):
-            return None
-        if sum(sizes[name] * reader.share(name, plans[name]) for name in plans) > WORTH * sum(sizes.values()):
-            return None
-        for name, rows in plans.items():
-            entry = manifest["arrays"][name]
-            pixels = reader.read(name, channel_names(entry["shape"][-1]), rows)
-            arrays[name] = _read_map(path, name, entry, pixels, manifest)
-        if bytes_read is not None:
-            bytes_read.append(reader.bytes_read)
+    for name, rows in plans.items():
+        entry = manifest["arrays"][name]
+        pixels = reader.read(name, channel_names(entry["shape"][-1]), rows)
+        arrays[name] = _read_map(path, name, entry, pixels, manifest, rows)
     return arrays
 
 
@@ -254,11 +257,8 @@ def read_info(path: PathLike) -> Facts:
         ``parent``, ``versions``; for methods whose paper counts the bytes of
         a layout of its own, ``published_layout`` with those.
     """
-    manifest, parts = _open(path, header_only=True)
+    manifest = _header(path)
     meta, maps = manifest["meta"], manifest["arrays"]
-    for name in maps:
-        if name not in parts:
-            raise InputError("a map is missing", file=path, field=name)
     views, lights = meta["views"], meta["lights"]
     shape = [views["count"], lights["count"], *meta["texels"], 3]
     maps = {name: {what: entry[what] for what in ("shape", "dtype")} for name, entry in maps.items()}
@@ -326,8 +326,8 @@ def refuse_store(path: Path) -> None:
         )
 
 
-def _open(path: PathLike, *, header_only: bool) -> tuple[Facts, dict[str, Any]]:
-    """Manifest and parts by name, after every check that needs no pixels."""
+def _opened(path: PathLike) -> tuple[Facts, RowReader]:
+    """The manifest of a file and a reader of its rows, after every check that needs no pixels."""
     path = Path(path)
     refuse_store(path)
     if not path.is_file():
@@ -340,38 +340,28 @@ def _open(path: PathLike, *, header_only: bool) -> tuple[Facts, dict[str, Any]]:
         raise InputError(
             "not an OpenEXR file", file=path, field="magic number", got=magic.hex(), expected=_MAGIC.hex()
         )
-    import OpenEXR
+    reader = RowReader(path)
+    try:
+        found = parsed(reader.attributes, path)
+        check_parts(found, reader, path)
+        check_layout(found, method(found["meta"]["method"], file=path).representation, path)
+    except BaseException:
+        reader.close()
+        raise
+    return found, reader
 
-    try:
-        # Channels stay apart: RGB grouping would reorder those of maps with many channels.
-        file = OpenEXR.File(str(path), separate_channels=True, header_only=header_only)
-        parts = {part.header.get("name", ""): part for part in file.parts}
-        text = file.parts[0].header.get(ATTRIBUTE)
-    except (RuntimeError, ValueError, OSError, IndexError, MemoryError) as error:
-        raise InputError(f"damaged or truncated OpenEXR file: {error}", file=path) from error
-    if text is None:
-        raise InputError(
-            "not a btfref representation", file=path, field=ATTRIBUTE, expected="a manifest attribute"
-        )
-    try:
-        manifest = json.loads(text)
-        schema = manifest["schema"]
-        manifest["meta"]["method"], manifest["arrays"].items()
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError("damaged manifest", file=path, field=ATTRIBUTE, got=repr(error)) from error
-    if schema > SCHEMA_VERSION:
-        raise InputError(
-            "written by a newer btfref", file=path, field="schema", got=schema, expected=f"≤ {SCHEMA_VERSION}"
-        )
-    return manifest, parts
+
+def _header(path: PathLike) -> Facts:
+    """The manifest alone."""
+    manifest, reader = _opened(path)
+    reader.close()
+    return manifest
 
 
 def _channels_of(path: PathLike, name: str, entry: Facts, part: Any) -> np.ndarray:
     """Pixels of a part, shape (rows, columns, channels), its channels in the order of the map's."""
-    shape = file_shape(entry)
-    kind = "float16" if entry["dtype"] == "uint8" else entry["dtype"]
-    result = np.zeros((*image_size(shape, len(entry.get("rows", ()))), shape[-1]), kind)
-    for i, channel in enumerate(channel_names(shape[-1])):
+    result = np.zeros(image_of_entry(entry), stored_type(entry))
+    for i, channel in enumerate(channel_names(result.shape[-1])):
         pixels = part.channels[channel].pixels if channel in part.channels else None
         if pixels is None or pixels.shape != result.shape[:2] or pixels.dtype != result.dtype:
             got = "nothing" if pixels is None else f"{pixels.dtype} {pixels.shape}"
@@ -386,29 +376,42 @@ def _channels_of(path: PathLike, name: str, entry: Facts, part: Any) -> np.ndarr
     return result
 
 
-def _read_map(path: PathLike, name: str, entry: Facts, result: np.ndarray, manifest: Facts) -> np.ndarray:
-    """A map from its pixels, checked."""
-    shape, leading = file_shape(entry), entry.get("rows", [])
-    byte = entry["dtype"] == "uint8"
-    partial = manifest["meta"].get("partial", False)
-    size = (*image_size(shape, len(leading)), shape[-1])
-    if result.shape != size or result.dtype != np.dtype("float16" if byte else entry["dtype"]):
-        raise InputError(
-            "a map is damaged",
-            file=path,
-            field=name,
-            got=f"{result.dtype} {result.shape[:2]}",
-            expected=f"{entry['dtype']} {size[:2]}",
-        )
+def _whole_file(path: PathLike, manifest: Facts) -> dict[str, np.ndarray]:
+    """All maps, by OpenEXR."""
+    try:
+        # Channels stay apart: RGB grouping would reorder those of maps with many channels.
+        with opened(path, separate_channels=True) as file:
+            parts = {part.header.get("name", ""): part for part in file.parts}
+            return {
+                name: _read_map(path, name, entry, _channels_of(path, name, entry, parts[name]), manifest)
+                for name, entry in manifest["arrays"].items()
+            }
+    except InputError:
+        raise
+    except (RuntimeError, ValueError, TypeError, OSError, KeyError, IndexError) as error:
+        raise InputError(f"damaged or truncated OpenEXR file: {error}", file=path) from error
+
+
+def _read_map(
+    path: PathLike,
+    name: str,
+    entry: Facts,
+    image: np.ndarray,
+    manifest: Facts,
+    rows: np.ndarray | None = None,
+) -> np.ndarray:
+    """A map from the pixels of its image, of which `rows` were read, checked."""
+    refuse_changed(path, name, entry, image, rows)
     # What a partial table lacks stands in it as NaN, and gives NaN where it is asked for.
+    partial = manifest["meta"].get("partial", False) and not name.startswith(("view_", "light_"))
     broken = np.isinf if partial else lambda values: ~np.isfinite(values)
-    if result.dtype.kind == "f" and broken(result).any():
+    if image.dtype.kind == "f" and broken(image).any():
         raise InputError("a map holds a value that is not finite", file=path, field=name)
-    if byte:
-        if ((result < 0) | (result > 1)).any():
+    if entry["dtype"] == "uint8":
+        if ((image < 0) | (image > 1)).any():
             raise InputError(
                 "an 8-bit map holds a value out of range", file=path, field=name, expected="[0, 1]"
             )
-        result = np.rint(result.astype(np.float32) * 255).astype(np.uint8)
-    result = result.reshape(shape)
+        image = np.rint(image.astype(np.float32) * 255).astype(np.uint8)
+    result, leading = image.reshape(file_shape(entry)), entry.get("rows", [])
     return np.ascontiguousarray(np.moveaxis(result, range(len(leading)), leading)) if leading else result

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 #: Columns up to which further axes become columns.
 MAXIMUM_WIDTH = 8192
 
+#: Rows of an image that belong together: those that OpenEXR compresses in one go, and that one checksum is of.
+BLOCK = 16
+
 
 def image_size(shape: Sequence[int], leading: int = 0) -> tuple[int, int]:
     """Rows and columns of the image that holds a map: trailing axes fold into columns while they fit.

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from btfref.errors import InputError
+from btfref.representations.file.map_images import BLOCK
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,16 +37,30 @@ _MULTI_PART = 0x1000
 
 
 @dataclass(frozen=True)
-class _PartHeader:
-    """What the header of a part says: channels in the order of the file, and where its chunks begin."""
+class PartHeader:
+    """What the header of a part says: channels in the order of the file, and where its chunks begin.
+
+    Attributes
+    ----------
+    channels : list of str
+    kind : numpy.dtype or None
+        Of all channels; None where they differ or are of no known type.
+    compression : int
+    rows, columns : int
+    chunks, offsets : int
+        Number of chunks, and where the table of their places is.
+    simple : bool
+        Of scan lines in a compression that is read here.
+    """
 
     channels: list[str]
-    kind: np.dtype
+    kind: np.dtype | None
     compression: int
     rows: int
     columns: int
     chunks: int
     offsets: int
+    simple: bool
 
     @property
     def lines(self) -> int:
@@ -64,6 +79,10 @@ class RowReader:
     ----------
     bytes_read : int
         Of headers, tables and chunks so far.
+    parts : dict of str to PartHeader
+        All parts, also those that cannot be read here.
+    attributes : dict of str to bytes
+        Of the first part.
 
     Raises
     ------
@@ -75,7 +94,7 @@ class RowReader:
         self.path, self.bytes_read = Path(path), 0
         self._stream = self.path.open("rb")
         try:
-            self._parts = self._headers()
+            self.attributes, self.parts = self._headers()
         except BaseException:
             self._stream.close()
             raise
@@ -84,16 +103,27 @@ class RowReader:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give the file back."""
         self._stream.close()
 
     def knows(self, name: str) -> bool:
         """Whether a part is there, of scan lines in a compression that is read here."""
-        return name in self._parts
+        return name in self.parts and self.parts[name].simple
 
     def share(self, name: str, rows: ArrayLike | None = None) -> float:
         """Share of a part's chunks that hold some rows: what :meth:`read` reads of it."""
-        part = self._parts[name]
-        return 1.0 if rows is None else len(np.unique(np.asarray(rows) // part.lines)) / part.chunks
+        part = self.parts[name]
+        return 1.0 if rows is None else len(self._chunks(part, rows)) / part.chunks
+
+    @staticmethod
+    def _chunks(part: PartHeader, rows: ArrayLike) -> np.ndarray:
+        """Chunks of the blocks that hold some rows: checksums are of whole blocks."""
+        blocks, each = np.unique(np.asarray(rows) // BLOCK), BLOCK // part.lines
+        chunks = (blocks[:, None] * each + np.arange(each)).ravel()
+        return chunks[chunks < part.chunks]
 
     def read(self, name: str, channels: Sequence[str], rows: ArrayLike | None = None) -> np.ndarray:
         """Pixels of a part.
@@ -104,7 +134,7 @@ class RowReader:
         channels : list of str
             In the order of the result.
         rows : array_like of int, optional
-            Rows to read, in any order; default all. Others of their chunks may be filled too.
+            Rows to read, in any order; default all. Others of their blocks of `BLOCK` rows are filled too.
 
         Returns
         -------
@@ -116,13 +146,14 @@ class RowReader:
         InputError
             For channels that are not there, and damaged or truncated files.
         """
-        part = self._parts[name]
+        part = self.parts[name]
         if sorted(channels) != part.channels:
             raise InputError(
                 "a map is damaged", file=self.path, field=name, got=f"channels {', '.join(part.channels)}"
             )
+        assert part.kind is not None
         place = [part.channels.index(channel) for channel in channels]
-        wanted = np.arange(part.chunks) if rows is None else np.unique(np.asarray(rows) // part.lines)
+        wanted = np.arange(part.chunks) if rows is None else self._chunks(part, rows)
         self._stream.seek(part.offsets)
         table = np.frombuffer(self._take(8 * part.chunks), "<u8")
         result = np.zeros((part.rows, part.columns, len(channels)), part.kind)
@@ -144,7 +175,8 @@ class RowReader:
 
     def _inflated(self, data: bytes, size: int) -> np.ndarray:
         try:
-            found = np.frombuffer(zlib.decompress(data), np.uint8)
+            # No more than belongs there: a few bytes may stand for gigabytes.
+            found = np.frombuffer(zlib.decompressobj().decompress(data, size + 1), np.uint8)
         except zlib.error as error:
             raise self._damaged(str(error)) from None
         if len(found) != size:
@@ -172,16 +204,16 @@ class RowReader:
                 raise self._damaged("a name without end")
         return letters.decode("utf-8", "replace")
 
-    def _headers(self) -> dict[str, _PartHeader]:
-        """Parts by name, those that can be read here."""
+    def _headers(self) -> tuple[dict[str, bytes], dict[str, PartHeader]]:
+        """Attributes of the first part, and all parts by name."""
         _, version = struct.unpack("<ii", self._take(8))
-        headers = []
+        headers: list[dict[str, bytes]] = []
         while True:
-            header = {}
+            header: dict[str, bytes] = {}
             while name := self._text():
                 self._text()
                 (size,) = struct.unpack("<i", self._take(4))
-                if size < 0:
+                if size < 0 or name in header:
                     raise self._damaged(f"attribute {name}")
                 header[name] = self._take(size)
             if not header:
@@ -189,29 +221,38 @@ class RowReader:
             headers.append(header)
             if not version & _MULTI_PART:
                 break
-        parts, offset = {}, self._stream.tell()
+        if not headers:
+            raise self._damaged("no header")
+        parts: dict[str, PartHeader] = {}
+        offset, end = self._stream.tell(), self.path.stat().st_size
         for header in headers:
-            try:
-                low_x, low_y, high_x, high_y = struct.unpack("<iiii", header["dataWindow"])
-                compression, channels = header["compression"][0], _channels(header["channels"])
-            except (KeyError, struct.error, IndexError, ValueError):
-                raise self._damaged("a header") from None
+            name = header.get("name", b"").rstrip(b"\0").decode("utf-8", "replace")
+            part = self._part(header, offset)
+            offset += 8 * part.chunks
+            if name in parts or offset > end:
+                raise self._damaged(f"part {name}")
+            parts[name] = part
+        return headers[0], parts
+
+    def _part(self, header: dict[str, bytes], offset: int) -> PartHeader:
+        try:
+            low_x, low_y, high_x, high_y = struct.unpack("<iiii", header["dataWindow"])
+            compression, channels = header["compression"][0], _channels(header["channels"])
             rows, columns = high_y - low_y + 1, high_x - low_x + 1
-            lines = LINES.get(compression, 1)
-            chunks = (
-                struct.unpack("<i", header["chunkCount"])[0] if "chunkCount" in header else -(-rows // lines)
-            )
-            kinds = {kind for _, kind in channels}
-            lines_of_one_kind = len(kinds) == 1 and kinds <= TYPES.keys() and low_y == 0
-            simple = lines_of_one_kind and header.get("type", b"scanlineimage") == b"scanlineimage"
-            if simple and compression in LINES:
-                name = header.get("name", b"").rstrip(b"\0").decode("utf-8", "replace")
-                names = [channel for channel, _ in channels]
-                parts[name] = _PartHeader(
-                    names, TYPES[kinds.pop()], compression, rows, columns, chunks, offset
-                )
-            offset += 8 * chunks
-        return parts
+            chunks = -(-rows // LINES.get(compression, 1))
+            if "chunkCount" in header:
+                (chunks,) = struct.unpack("<i", header["chunkCount"])
+        except (KeyError, struct.error, IndexError, ValueError):
+            raise self._damaged("a header") from None
+        if rows < 1 or columns < 1 or chunks < 1 or not channels:
+            raise self._damaged("a header")
+        kinds = {kind for _, kind in channels}
+        kind = TYPES.get(kinds.pop()) if len(kinds) == 1 else None
+        lines = compression in LINES and chunks == -(-rows // LINES[compression])
+        scan_lines = header.get("type", b"scanlineimage") == b"scanlineimage"
+        simple = lines and scan_lines and kind is not None and low_y == 0
+        names = [channel for channel, _ in channels]
+        return PartHeader(names, kind, compression, rows, columns, chunks, offset, simple)
 
     def _damaged(self, what: str) -> InputError:
         return InputError(f"damaged or truncated OpenEXR file: {what}", file=self.path)

@@ -18,18 +18,28 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from btfref import conventions
-from btfref.numerics.heightfield import LIFT, HeightField
+from btfref.numerics.heightfield import HEIGHT_LIMIT, LIFT, HeightField
 from btfref.numerics.microfacets import geometry_factor, schlick, specular_albedo_bound
 from btfref.numerics.sphere.frames import surface_frame
 from btfref.numerics.sphere.halfway import half_vector
 from btfref.numerics.sphere.parabolic import bilinear_stencil
 from btfref.precision import computing_in, real
 from btfref.representations.file.resident import refuse_absent
+from btfref.representations.file.schema import (
+    FLOATS,
+    INDICES,
+    LARGEST,
+    Constant,
+    MapSchema,
+    Range,
+    Schema,
+)
 from btfref.representations.guide import group_means, spread_members, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points
 from btfref.representations.protocol import Entries
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
     from typing import Self
 
     from numpy.typing import ArrayLike
@@ -64,6 +74,32 @@ class Representation(StoredMaps):
     """
 
     ENTRIES: ClassVar = Entries("material", {"ndf": 0, "specular": 0}, "fresnel")
+
+    @classmethod
+    def schema(cls, meta: Facts, names: Collection[str]) -> Schema:
+        """What its files hold; see :class:`btfref.representations.protocol.HasSchema`."""
+
+        def unit(axes: str, *, absent: bool = False) -> MapSchema:
+            return MapSchema(axes, FLOATS, least=0, most=1, absent=absent)
+
+        maps = {
+            "height": unit("rows columns 1"),
+            "rotation": unit("rows columns 1"),
+            "diffuse": unit("rows columns 3"),
+            "fresnel": unit("rows columns 1", absent=True),
+            "material": MapSchema("rows columns 1", INDICES, below=("ndf",)),
+            "ndf": MapSchema("materials side side 3", FLOATS, least=0),
+            "specular": unit("materials 1"),
+        }
+        low = meta["constants"].get("height_min")
+        low = low if isinstance(low, float | int) and -HEIGHT_LIMIT <= low <= HEIGHT_LIMIT else -HEIGHT_LIMIT
+        constants: dict[str, Constant] = {
+            "height_min": Range(-HEIGHT_LIMIT, HEIGHT_LIMIT),
+            "height_max": Range(low, HEIGHT_LIMIT),
+        }
+        # Whatever they are, they are made anew of the heights: :meth:`from_arrays`.
+        derived = ("top", "bottom", "tangent_limit", "lift", "maximum_steps")
+        return Schema(maps, constants | dict.fromkeys(derived, Range(-LARGEST, LARGEST)), optional=derived)
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray], meta: Facts) -> Self:

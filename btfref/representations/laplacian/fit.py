@@ -12,7 +12,7 @@ from btfref.numerics.pyramid import expand_image, gaussian_pyramid, level_shapes
 from btfref.numerics.solvers.lowrank import range_basis, texel_matrix
 from btfref.numerics.ycbcr import CHANNELS, FROM_RGB, RGB_METRIC, RGB_WEIGHT
 from btfref.representations.analytic.light_functions import edge_constants
-from btfref.representations.laplacian.levels import Representation
+from btfref.representations.laplacian.levels import Representation, level_constants
 from btfref.representations.lookup import base_meta, direction_arrays, refuse_not_finite, stored, unit_peaks
 
 if TYPE_CHECKING:
@@ -138,7 +138,10 @@ def fit(
     }
     meta = base_meta("laplacian", btf, parameters, filter_type=filter_type)
     meta["levels"] = described
-    meta["constants"] = _constants(btf, described, directions)
+    meta["constants"] = level_constants(described) | {
+        "nearest_directions": directions == "nearest",
+        **edge_constants(btf),
+    }
     meta["fit"] = {**state.errors(), **facts}
     if counts == COMPONENTS:
         meta["published_layout"] = packed_layout(len(shapes), texels, len(btf.views), len(btf.lights))
@@ -184,33 +187,6 @@ def _counts(components: object) -> tuple[int, int, int]:
         )
     y, cb, cr = numbers
     return y, cb, cr
-
-
-def _constants(btf: SampledBTF, levels: list[Facts], directions: str) -> Facts:
-    """What ports need: levels with components, their sizes and first texels, numbers of components."""
-    used = [k for k, level in enumerate(levels) if any(level["components"])]
-    n = max(used, default=0) + 1
-    rows, columns = ([level[axis] for level in levels[:n]] for axis in ("rows", "columns"))
-    first = np.cumsum([0, *(r * c for r, c in zip(rows, columns, strict=True))])[:-1].tolist()
-    most = np.max([level["components"] for level in levels[:n]], axis=0).tolist()
-    # A table needs a column, even for a BTF without any variation.
-    most[0] = max(most[0], 1)
-    text = {
-        name: f"int[{n}]({', '.join(map(str, values))})"
-        for name, values in zip(
-            ("level_rows", "level_columns", "level_first"), (rows, columns, first), strict=True
-        )
-    }
-    return {
-        "n_levels": n,
-        "max_lod": float(len(levels) - 1),
-        "n_y": most[0],
-        "n_cb": most[1],
-        "n_cr": most[2],
-        "nearest_directions": directions == "nearest",
-        **text,
-        **edge_constants(btf),
-    }
 
 
 def _pyramids(btf: SampledBTF, n_levels: int, reduction: str) -> list[list[np.ndarray]]:

@@ -10,16 +10,28 @@ import numpy as np
 from btfref.conventions import texel_stencil
 from btfref.errors import InputError
 from btfref.numerics.phong import phong
-from btfref.numerics.pyramid import clamped_lod, expand_image, level_weights
+from btfref.numerics.pyramid import clamped_lod, expand_image, level_shapes, level_weights
 from btfref.numerics.sphere import interpolation
 from btfref.numerics.ycbcr import TO_RGB
 from btfref.precision import real
-from btfref.representations.analytic.light_functions import held
+from btfref.representations.analytic.light_functions import EDGES, held
+from btfref.representations.file.schema import FLOATS, Constant, MapSchema, OneOf, Range, Schema
 from btfref.representations.guide import N_GROUPS, feature_views, group_means, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points, packed_arrays
 
 if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+
     from numpy.typing import ArrayLike
+
+    from btfref.types import Facts
+
+
+#: Exponent of a Phong mean that a file may hold: fits stay within 512.
+LARGEST_EXPONENT = 65504.0
+
+#: Components of a channel that a level may have.
+MOST_COMPONENTS = 4096
 
 
 class Representation(StoredMaps):
@@ -33,6 +45,31 @@ class Representation(StoredMaps):
     DIRECTION_AXES: ClassVar = {"view": {"basis_*": 0, "mean": 0}, "light": {"basis_*": 1, "mean": 1}}
     LEVELS: ClassVar = ("basis_*", "weights_*")
     ROWS_BY: ClassVar = {"basis_*": (0,), "mean": (0,)}
+
+    @classmethod
+    def schema(cls, meta: Facts, names: Collection[str]) -> Schema:
+        """What its files hold; see :class:`btfref.representations.protocol.HasSchema`."""
+        levels = checked_levels(meta)
+        first = meta["constants"].get("first_level", 0)
+        if type(first) is not int or not 0 <= first < len(levels):
+            expected = Range(0, len(levels) - 1, whole=True)
+            raise InputError(
+                "a level is not there", field="constants.first_level", got=first, expected=expected
+            )
+        maps = {}
+        for k, level in enumerate(levels):
+            n = sum(level["components"])
+            if n and k >= first:
+                maps[f"weights_{k}"] = MapSchema(f"{level['rows']} {level['columns']} {n}")
+                maps[f"basis_{k}"] = MapSchema(f"views lights {n}")
+        if "phong" in names:
+            exponent = {(3, 6): Range(0, LARGEST_EXPONENT)}
+            maps["phong"] = MapSchema("1 6", FLOATS, parts=exponent)
+        else:
+            maps["mean"] = MapSchema("views lights 3")
+        constants: dict[str, Constant] = {k: OneOf((v,)) for k, v in level_constants(levels).items()}
+        constants |= {"nearest_directions": OneOf((False, True)), "first_level": OneOf((first,)), **EDGES}
+        return Schema(maps, constants, optional=("first_level",))
 
     @property
     def first_level(self) -> int:
@@ -202,6 +239,54 @@ class Representation(StoredMaps):
             return self.maps["mean"][..., channel].astype(np.float32)
         shape = [len(self.maps[f"{kind}_directions"]) for kind in ("view", "light")]
         return np.full(shape, self.maps["phong"][0, 3 + channel], np.float32)
+
+
+def checked_levels(meta: Facts) -> list[Facts]:
+    """``meta["levels"]`` of a file: sizes that are those of a pyramid, and numbers of components.
+
+    Raises
+    ------
+    InputError
+    """
+    levels = meta["levels"]
+    expected = "a list of rows, columns and three numbers of components"
+    if not isinstance(levels, list) or not levels:
+        raise InputError("damaged manifest", field="levels", got=repr(levels)[:60], expected=expected)
+    shapes = level_shapes(meta["texels"], len(levels))
+    for k, (level, shape) in enumerate(zip(levels, shapes, strict=True)):
+        counts = level["components"]
+        sizes = [level["rows"], level["columns"]]
+        whole = all(type(n) is int and 0 <= n <= MOST_COMPONENTS for n in (*counts, *sizes))
+        if not whole or len(counts) != 3 or tuple(sizes) != shape:
+            got = repr([*sizes, counts])[:60]
+            wanted = f"{shape[0]}, {shape[1]} and three numbers of components"
+            raise InputError("damaged manifest", field=f"levels[{k}]", got=got, expected=wanted)
+    return levels
+
+
+def level_constants(levels: Sequence[Facts]) -> Facts:
+    """What ports need of the levels: those with components, their sizes and first texels, numbers of components."""
+    used = [k for k, level in enumerate(levels) if any(level["components"])]
+    n = max(used, default=0) + 1
+    rows, columns = ([level[axis] for level in levels[:n]] for axis in ("rows", "columns"))
+    first = np.cumsum([0, *(r * c for r, c in zip(rows, columns, strict=True))])[:-1].tolist()
+    most = np.max([level["components"] for level in levels[:n]], axis=0).tolist()
+    # A table needs a column, even for a BTF without any variation.
+    most[0] = max(most[0], 1)
+    text = {
+        name: f"int[{n}]({', '.join(map(str, values))})"
+        for name, values in zip(
+            ("level_rows", "level_columns", "level_first"), (rows, columns, first), strict=True
+        )
+    }
+    return {
+        "n_levels": n,
+        "max_lod": float(len(levels) - 1),
+        "n_y": most[0],
+        "n_cb": most[1],
+        "n_cr": most[2],
+        **text,
+    }
 
 
 def _heaviest(index: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -18,6 +18,7 @@ from btfref.numerics.solvers.lowrank import range_basis, refined_basis, texel_ma
 from btfref.numerics.solvers.threads import one_blas_thread
 from btfref.precision import real
 from btfref.representations.file.resident import refuse_absent
+from btfref.representations.file.schema import INDICES, MapSchema, Number, Schema
 from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
     StoredMaps,
@@ -32,11 +33,13 @@ from btfref.representations.lookup import (
 from btfref.representations.protocol import Entries
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from numpy.typing import ArrayLike
 
     from btfref.representations.lookup import Stencils
     from btfref.sampling.sampled_btf import SampledBTF
-    from btfref.types import Progress
+    from btfref.types import Facts, Progress
 
 
 #: "paper": the setting of the 2004 paper's timings, 16 clusters with a mean and 4 components, in floats.
@@ -60,6 +63,16 @@ class Representation(StoredMaps):
     DIRECTION_AXES: ClassVar = {"view": {"basis": 2}, "light": {"basis": 3}}
     ENTRIES: ClassVar = Entries("cluster", {"basis": 0}, "weights")
     ROWS_BY: ClassVar = {"basis": (0, 2)}
+
+    @classmethod
+    def schema(cls, meta: Facts, names: Collection[str]) -> Schema:
+        """What its files hold; see :class:`btfref.representations.protocol.HasSchema`."""
+        maps = {
+            "weights": MapSchema("rows columns components", absent=True),
+            "basis": MapSchema("clusters components+1 views lights 3"),
+            "cluster": MapSchema("rows columns 1", INDICES, below=("basis",)),
+        }
+        return Schema(maps, {"n_components": Number("components")})
 
     def evaluate(
         self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0

@@ -10,6 +10,7 @@ from btfref import conventions
 from btfref.errors import InputError
 from btfref.precision import real
 from btfref.representations.file.resident import KINDS, slots_name, slots_of
+from btfref.representations.file.schema import MapSchema, Schema
 from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
     StoredMaps,
@@ -21,6 +22,8 @@ from btfref.representations.lookup import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from numpy.typing import ArrayLike
 
     from btfref.representations.lookup import Stencils
@@ -36,6 +39,11 @@ class Representation(StoredMaps):
     """Table ``values`` [row, column, view, light, 3] and the directions it is sampled at."""
 
     DIRECTION_AXES: ClassVar = {"view": {"values": 2}, "light": {"values": 3}}
+
+    @classmethod
+    def schema(cls, meta: Facts, names: Collection[str]) -> Schema:
+        """What its files hold; see :class:`btfref.representations.protocol.HasSchema`."""
+        return Schema({"values": MapSchema("rows columns views lights 3", absent=True)})
 
     def evaluate(
         self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0

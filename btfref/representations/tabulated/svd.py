@@ -13,6 +13,7 @@ import numpy as np
 from btfref import conventions
 from btfref.numerics.solvers.lowrank import range_basis, texel_matrix
 from btfref.precision import real
+from btfref.representations.file.schema import MapSchema, Number, Schema
 from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
     StoredMaps,
@@ -26,11 +27,13 @@ from btfref.representations.lookup import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from numpy.typing import ArrayLike
 
     from btfref.representations.lookup import Stencils
     from btfref.sampling.sampled_btf import SampledBTF
-    from btfref.types import Progress
+    from btfref.types import Facts, Progress
 
 
 #: Koudelka et al. keep 150 components for one texture; 16 cost a lookup about three times what local PCA's 4 cost.
@@ -42,6 +45,15 @@ class Representation(StoredMaps):
 
     DIRECTION_AXES: ClassVar = {"view": {"basis": 1}, "light": {"basis": 2}}
     ROWS_BY: ClassVar = {"basis": (1,)}
+
+    @classmethod
+    def schema(cls, meta: Facts, names: Collection[str]) -> Schema:
+        """What its files hold; see :class:`btfref.representations.protocol.HasSchema`."""
+        maps = {
+            "weights": MapSchema("rows columns components"),
+            "basis": MapSchema("components views lights 3"),
+        }
+        return Schema(maps, {"n_components": Number("components")})
 
     def evaluate(
         self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0

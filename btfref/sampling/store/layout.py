@@ -69,6 +69,9 @@ CONVENTIONS = {
 #: Ends the name of whatever is not finished.
 DRAFT = ".partial"
 
+#: Ends the name of what says who writes a store: :mod:`btfref.sampling.store.lock`.
+LOCK = ".lock.partial"
+
 
 def attributes_of(path: PathLike) -> Facts:
     """Attributes of a store, read from its header alone.
@@ -238,6 +241,8 @@ def remove_leftovers(path: PathLike) -> None:
     if path.absolute().parent.is_dir():
         for draft in path.absolute().parent.iterdir():
             if not (draft.name.startswith(path.name + ".") and draft.name.endswith(DRAFT)):
+                continue
+            if draft.name == path.name + LOCK:  # held, or ended with its process
                 continue
             if draft.is_dir():
                 shutil.rmtree(draft, ignore_errors=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 from collections.abc import Callable, Sequence
@@ -25,6 +26,19 @@ if TYPE_CHECKING:
     from btfref.types import Facts, PathLike
 
 _T = TypeVar("_T")
+
+#: Errors of a place and not of what stands there: full, too large, read-only, not permitted, too many files.
+OF_THE_SYSTEM = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EMFILE,
+    errno.ENFILE,
+    errno.ENOMEM,
+)
 
 
 def create_store(
@@ -74,8 +88,14 @@ def create_store(
     # A fixed name: what a killed run left is found and removed by the next one.
     draft = path.with_name(path.name + DRAFT)
     shutil.rmtree(draft, ignore_errors=True)
-    write_headers(draft, views, lights, texels, dtype, variance, tile, attributes, adaptive)
-    os.rename(draft, path)
+    try:
+        write_headers(draft, views, lights, texels, dtype, variance, tile, attributes, adaptive)
+        os.rename(draft, path)
+    except BaseException as error:
+        shutil.rmtree(draft, ignore_errors=True)
+        if isinstance(error, OSError) and error.errno is not None:
+            raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
+        raise
     return BTFStore(path)
 
 
@@ -154,11 +174,17 @@ class BTFStore:
         return in_one_line(kind, self.texels, self.views.facts, self.lights.facts, size)
 
     def _guard(self, field: str, action: Callable[[], _T]) -> _T:
-        """Whatever Zarr makes of a damaged file becomes one clear line."""
+        """Whatever Zarr makes of a damaged file becomes one clear line; a full disk is no damage."""
         try:
             return action()
         except InputError:
             raise
+        except MemoryError:
+            raise
+        except OSError as error:
+            if error.errno in OF_THE_SYSTEM:
+                raise OSError(error.errno, os.strerror(error.errno), str(self.path)) from error
+            raise InputError("damaged store", file=self.path, field=field, got=error) from error
         except Exception as error:
             raise InputError("damaged store", file=self.path, field=field, got=error) from error
 

@@ -128,10 +128,19 @@ def test_exit_status_of_errors(error, status, text, monkeypatch, capsys):
     assert capsys.readouterr().err == text
 
 
-def test_a_bug_keeps_its_traceback(monkeypatch):
+def test_a_bug_keeps_its_traceback(monkeypatch, tmp_path, capsys):
+    """In a file that the one line names."""
     monkeypatch.setattr("btfref.commands.info.read", lambda path: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        main(["info", "x"])
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert main(["info", "x"]) == 70
+    line = capsys.readouterr().err
+    (details,) = tmp_path.iterdir()
+    assert line.startswith("btfref: error: internal error, please report it: ZeroDivisionError")
+    assert line.endswith(f"details: {details}\n")
+    assert "Traceback" in details.read_text()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "none"))
+    assert main(["info", "x"]) == 70
+    assert "test_cli.py" in capsys.readouterr().err
 
 
 def test_a_reader_that_leaves_is_no_error():

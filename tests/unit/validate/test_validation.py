@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from html.parser import HTMLParser
 
 import jsonschema
 import numpy as np
@@ -284,6 +285,58 @@ def test_the_report_works_from_disk(result, tmp_path, need, width):
     text += "".join(cells)
     assert "Where the error comes from" in text
     assert not re.search(r'(src|href)="https?:', text)
+
+
+class _Elements(HTMLParser):
+    """Elements of a page that its own text does not have."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.found = []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        """Whatever would run or load something of an attacker."""
+        self.found += [name for name, _ in attrs if name.startswith("on")]
+        self.found += [tag] if tag == "hostile" else []
+
+
+def _hostile(data, evil):
+    """Every text of JSON-able data with an attack behind it, but for what is looked up in tables."""
+    if isinstance(data, dict):
+        kept = ("outcome", "entry", "gate", "sign", "pixel_class", "name")
+        return {k: v if k in kept and k != "name" else _hostile(v, evil) for k, v in data.items()}
+    if isinstance(data, list | tuple):
+        return [_hostile(one, evil) for one in data]
+    return data + evil if isinstance(data, str) else data
+
+
+def test_hostile_names_cannot_break_the_pages(result, tmp_path):
+    """Names of methods, mesostructures, scenes and lights, notes, reasons and facts come from files and packages."""
+    evil = """\"'></script></td><hostile onclick=alert(1)>{{css}}"""
+    cells = []
+    for cell in result.cells:
+        facts = dict(cell.facts)
+        for name in ("name", "method", "mesostructure", "scene", "lights", "notes"):
+            facts[name] = f"{facts[name]}{evil}"
+        facts["gates"] = _hostile(json.loads(json.dumps(facts["gates"])), evil)
+        facts["waterfall"] = facts["waterfall"] | {"explanation": facts["waterfall"]["explanation"] + evil}
+        cells.append(replace(cell, facts=facts))
+    methods = [
+        m | {"method": m["method"] + evil, "mesostructure": m["mesostructure"] + evil, "notes": evil}
+        for m in result.methods
+    ]
+    made = replace(result, cells=cells, methods=methods, facts={evil: {evil: evil}, "code": evil})
+    index = write_validation(tmp_path / "report", made)
+    pages = [path.read_text("utf-8") for path in index.parent.rglob("*.html")]
+    assert len(pages) == 1 + len(cells)
+    for page in pages:
+        assert _Elements(page).found == []
+        packed = re.search(r'id="packed">([^<]*)<', page)
+        if packed:
+            inside = unpack_text(packed[1])
+            assert "alert(1)" in inside
+            assert _Elements(inside).found == []
 
 
 def test_settings_say_how_finely():

@@ -3,6 +3,7 @@
 import numpy as np
 
 from btfref import conventions
+from btfref.representations.file.schema import MapSchema, Schema
 from btfref.representations.lookup import (
     StoredMaps,
     base_meta,
@@ -16,6 +17,11 @@ PRESETS = {"paper": {}}
 
 class Representation(StoredMaps):
     """Maps: ``brdf`` [view, light, 3] in 1/sr, ``tint`` [row, column, 3]."""
+
+    @classmethod
+    def schema(cls, meta, names):
+        """What its files hold: they are checked before the ports see them."""
+        return Schema({"brdf": MapSchema("views lights 3"), "tint": MapSchema("rows columns 3")})
 
     def evaluate(self, uv, w_light, w_view, *, lod=0.0):
         """B in 1/sr, cosine included, float64; ``lod`` is ignored."""

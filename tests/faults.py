@@ -1,0 +1,385 @@
+"""Commands and what may go wrong with them: the faults, the exit status and the words of the one line.
+
+``test_faults.py`` runs all rows; ``page`` makes the table of the documentation of what they said.
+"""
+
+import contextlib
+import errno
+import json
+import os
+import re
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from btfref.errors import MissingDependencyError
+from btfref.representations.file.container import load, save
+
+PAGE = "btfref/docs/pages/reference/faults.md"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A command under a fault.
+
+    ``prepare(folder, monkeypatch)`` makes the fault; a string of `words` must be in the line.
+    """
+
+    item: str
+    fault: str
+    command: str
+    words: tuple = ()
+    status: int = 2
+    prepare: object = field(default=lambda folder, patch: None)
+
+
+def with_meta(change):
+    """A representation whose facts are changed."""
+
+    def prepare(folder, patch):
+        good = load(folder / "good.exr")
+        meta = json.loads(json.dumps(good.meta))
+        change(meta)
+        save(type(good)(good.arrays(), meta), folder / "good.exr")
+
+    return prepare
+
+
+def with_array(name, change):
+    """A representation one table of which is changed."""
+
+    def prepare(folder, patch):
+        good = load(folder / "good.exr")
+        arrays = {key: array.copy() for key, array in good.arrays().items()}
+        arrays[name] = change(arrays[name])
+        save(type(good)(arrays, good.meta), folder / "good.exr")
+
+    return prepare
+
+
+def setting(*path, value):
+    def change(meta):
+        for key in path[:-1]:
+            meta = meta[key]
+        meta[path[-1]] = value
+
+    return with_meta(change)
+
+
+def without(name):
+    return with_meta(lambda meta: meta.pop(name))
+
+
+def failing(place, error):
+    """A function of ours or of a library that raises."""
+
+    def prepare(folder, patch):
+        def fail(*_, **__):
+            raise error
+
+        patch.setattr(place, fail)
+
+    return prepare
+
+
+def full(place="btfref.representations.file.container.write"):
+    return failing(place, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "out.exr"))
+
+
+def fifo(name):
+    return lambda folder, patch: os.mkfifo(folder / name)
+
+
+def link(name, target):
+    return lambda folder, patch: (folder / name).symlink_to(target)
+
+
+def other(folder, patch):
+    """The good scene under a name that outputs have beside it."""
+    save(load(folder / "good.exr"), folder / "other.exr")
+
+
+def locked(folder, patch):
+    from btfref.sampling.store.lock import writing
+
+    held = contextlib.ExitStack()
+    held.enter_context(writing(folder / "busy.btf.zarr"))
+    # Given back when the patches are.
+    patch.setattr("btfref.cli.LONGEST", 2000)
+    patch.held = held
+
+
+def no_llvm(folder, patch):
+    from btfref.platform import LLVMChoice
+
+    patch.setattr("btfref.platform.choose_llvm", lambda *_: LLVMChoice(None, None, "none found", ()))
+
+
+def points(**found):
+    """Entry points of a package that do what `found` says."""
+
+    def prepare(folder, patch):
+        from btfref import registry
+
+        class Point:
+            dist = None
+            group = registry.ENTRY_POINT_GROUP
+
+            def __init__(self, name, load):
+                self.name, self.value, self.load = name, f"{name}:ROW", load
+
+        def entry_points(*, group, name=None):
+            return [Point(n, load) for n, load in found.items() if group == registry.ENTRY_POINT_GROUP]
+
+        patch.setattr(registry, "entry_points", entry_points)
+        for cached in (registry.usable_points, registry.methods, registry._all_methods):
+            cached.cache_clear()
+
+    return prepare
+
+
+def broken():
+    raise ImportError("no module named 'gone'")
+
+
+def read_only(folder, patch):
+    patch.setattr("btfref.commands.shared.reading.os.access", lambda *_: False)
+
+
+RENDER, REALTIME = "render good.xml -o out.exr --grid 1", "realtime good.xml -o out.exr"
+
+ROWS = [
+    # 1
+    Row("outputs", "a file of the scene", "render good.xml -o good.exr --grid 1", ("input", "good.exr")),
+    Row("outputs", "the same", "realtime good.xml -o good.exr", ("input", "good.exr")),
+    Row(
+        "outputs",
+        "a link to it",
+        "realtime good.xml -o link.exr",
+        ("input",),
+        prepare=link("link.exr", "good.exr"),
+    ),
+    Row("outputs", "its input", "import image.exr --format photograph -o image.exr", ("input",)),
+    Row("outputs", "in the input", "info good.btf.zarr --plot good.btf.zarr/plot.png", ("lies in",)),
+    Row("outputs", "in the input", "export good.btf.zarr --format ubo -o good.btf.zarr/out", ("lies in",)),
+    Row("outputs", "in the input", "fit raw good.btf.zarr -o good.btf.zarr/out.exr", ("lies in",)),
+    Row("outputs", "a picture there", "fit raw good.btf.zarr -o image.exr", ("picture", "--overwrite")),
+    Row(
+        "outputs",
+        "a representation there",
+        RENDER.replace("out", "other"),
+        ("representation",),
+        prepare=other,
+    ),
+    Row(
+        "outputs",
+        "a representation there",
+        REALTIME.replace("out", "other"),
+        ("representation",),
+        prepare=other,
+    ),
+    Row("outputs", "a store there", "demo -o good.btf.zarr", ("sampled BTF",)),
+    Row("outputs", "a store there", "validate --quick -o good.btf.zarr", ("sampled BTF",)),
+    Row(
+        "outputs",
+        "a scene there",
+        "fit raw good.btf.zarr -o scene.exr",
+        ("another kind",),
+        prepare=lambda folder, patch: (folder / "scene.exr").write_text("<scene/>"),
+    ),
+    Row("outputs", "twice the same", RENDER + " --png --classes out.png", ("two outputs",)),
+    Row("outputs", "a pipe", "fit raw good.btf.zarr -o pipe.exr", ("pipe",), prepare=fifo("pipe.exr")),
+    # 2
+    *(
+        Row("contents", fault, command, ("good.exr", word), prepare=prepare)
+        for fault, word, prepare in (
+            ("texels=[1000, 1000]", "values", setting("texels", value=[1000, 1000])),
+            ("texels=[4e9, 4e9]", "texels", setting("texels", value=[4_000_000_000, 4_000_000_000])),
+            ("views.count=4e9", "views.count", setting("views", "count", value=4_000_000_000)),
+            ("filter_type=cubic", "filter_type", setting("filter_type", value="cubic")),
+            ("a foreign constant", "constants.values_dim0", setting("constants", "values_dim0", value=9)),
+            ("view_cells=1e9", "view_cells", with_array("view_cells", lambda a: a * 0 + 1e9)),
+            ("view_triangles=1e9", "view_triangles", with_array("view_triangles", lambda a: a * 0 + 1e9)),
+            ("NaN", "values", with_array("values", lambda a: a * np.float32(np.nan))),
+        )
+        for command in (
+            "info good.exr",
+            RENDER,
+            REALTIME,
+            "demand good.xml",
+            "export good.exr -o new --format maps",
+        )
+        if not (command.startswith("info") and fault in ("view_cells=1e9", "view_triangles=1e9", "NaN"))
+        and (command.startswith(("info", "render")) or fault in ("texels=[1000, 1000]", "view_cells=1e9"))
+    ),
+    # 3
+    *(
+        Row("manifest", fault, "info good.exr", ("good.exr", word), prepare=prepare)
+        for fault, word, prepare in (
+            ("no filter_type", "filter_type", without("filter_type")),
+            ("no views", "views", without("views")),
+            ("texels of text", "texels", setting("texels", value="2x2")),
+            ("texels=[-1, 2]", "texels", setting("texels", value=[-1, 2])),
+            ("lights.count=true", "lights.count", setting("lights", "count", value=True)),
+            ("a list of versions", "versions", setting("versions", value=[])),
+            ("another method", "values", setting("method", value="svd")),
+            ("no such method", "nonsense", setting("method", value="nonsense")),
+        )
+    ),
+    # 4
+    Row("place", "no LLVM", RENDER, ("LLVM",), prepare=no_llvm),
+    Row("place", "no LLVM", "synth flat -o new.btf.zarr --texels 2 --spp 2", ("LLVM",), prepare=no_llvm),
+    Row(
+        "place",
+        "no CUDA",
+        f"{RENDER} --variant cuda_ad_rgb",
+        ("CUDA",),
+        prepare=failing("mitsuba.set_variant", ImportError("no CUDA")),
+    ),
+    Row(
+        "place",
+        "no OpenGL",
+        REALTIME,
+        ("OpenGL", "install"),
+        prepare=failing(
+            "btfref.rendering.gl.device.context", MissingDependencyError("no OpenGL", "install it")
+        ),
+    ),
+    Row(
+        "place",
+        "disk full",
+        "fit raw good.btf.zarr -o out.exr",
+        ("No space left", "move it"),
+        prepare=lambda folder, patch: _full_once(folder, patch),
+    ),
+    Row(
+        "place",
+        "disk full",
+        "export good.btf.zarr --format bonn -o new.btf",
+        ("No space left",),
+        prepare=failing(
+            "btfref.formats.bonn.export.new_file", OSError(errno.ENOSPC, "No space left on device")
+        ),
+    ),
+    Row("place", "read-only", "fit raw good.btf.zarr -o out.exr", ("read-only",), prepare=read_only),
+    Row("place", "a pipe to read", "info pipe.exr", ("pipe",), prepare=fifo("pipe.exr")),
+    Row(
+        "place",
+        "a pipe to read",
+        "synth flat -o new.btf.zarr --views pipe.txt",
+        ("pipe",),
+        prepare=fifo("pipe.txt"),
+    ),
+    Row("place", "a name that is no text", "info bad\udcff.exr", ("UTF-8",)),
+    Row(
+        "place",
+        "no memory",
+        "fit raw good.btf.zarr -o out.exr",
+        ("memory",),
+        prepare=failing("btfref.representations.tabulated.raw.fit", MemoryError("Unable to allocate 9 TiB")),
+    ),
+    Row(
+        "place",
+        "an error of ours",
+        "fit raw good.btf.zarr -o out.exr",
+        ("internal error", "details"),
+        70,
+        prepare=failing("btfref.representations.tabulated.raw.fit", KeyError("nobody thought of it")),
+    ),
+    # 5
+    *(
+        Row("numbers", "more than there can be", command, (word,))
+        for command, word in (
+            ("synth flat -o new.btf.zarr --only-views 0-99999999999", "at most"),
+            ("synth flat -o new.btf.zarr --views 9999x9999", "at most"),
+            ("synth flat -o new.btf.zarr --texels 99999", "4096"),
+            ("synth flat -o new.btf.zarr --spp 3000000000", "at most"),
+            ("synth flat -o new.btf.zarr --workers 99999", "at most"),
+            ("render good.xml -o out.exr --size 100000x100000", "at most"),
+            ("render good.xml -o out.exr --spp 3000000000", "at most"),
+            ("render good.xml -o out.exr --grid 100000", "at most"),
+            ("render good.xml -o out.exr --seed 99999999999", "at most"),
+            ("realtime good.xml -o out.exr --grid 1000", "at most"),
+            ("realtime good.xml -o out.exr --lights 999999999", "at most"),
+            ("realtime good.xml -o out.exr --transfer clusters=99999999", "4096"),
+            ("demand good.xml --grid 1000", "at most"),
+            ("demand good.xml --views 9999x9999", "at most"),
+            ("info good.btf.zarr --plot new.png --texel 0,99999999999", "indices"),
+            ("compare image.exr good.xml --size 100000x100000", "at most"),
+        )
+    ),
+    # 6
+    Row(
+        "memory",
+        "too small a budget",
+        "synth flat -o new.btf.zarr --texels 2 --spp 2 --memory 1M",
+        ("memory",),
+    ),
+    # 7
+    Row(
+        "locks",
+        "another writer",
+        "synth flat -o busy.btf.zarr --texels 2 --spp 2",
+        ("process",),
+        prepare=locked,
+    ),
+    # 8
+    Row(
+        "packages",
+        "a broken method",
+        "fit gone good.btf.zarr -o out.exr",
+        ("gone",),
+        prepare=points(gone=broken),
+    ),
+    Row(
+        "packages", "of another type", "fit odd good.btf.zarr -o out.exr", ("odd",), prepare=points(odd=dict)
+    ),
+    Row("packages", "no such exporter", "export good.btf.zarr --format gone -o new", ("ubo", "utia", "bonn")),
+]
+
+
+def _full_once(folder, patch):
+    """The disk of the output is full, that of temporary files is not."""
+    from btfref.images import openexr
+
+    def write(parts, path, channels=None):
+        if str(folder) in str(path) and "elsewhere" not in str(path):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        openexr.write(parts, path, channels)
+
+    (folder / "elsewhere").mkdir()
+    patch.setattr("tempfile.tempdir", str(folder / "elsewhere"))
+    patch.setattr("btfref.representations.file.container.write", write)
+
+
+def plain(line, folder):
+    """A line without what differs from run to run."""
+    line = line.removeprefix("btfref: error: ").replace(f"{folder}/", "").strip()
+    line = re.sub(r"\S*btfref-[\w-]+\S*", "…", line)
+    line = re.sub(r"process \d+ on \S+", "process … on …", line)
+    return line.replace("|", "\\|").replace("\\x", "\\\\x")
+
+
+def _ascii(text):
+    return text.encode("ascii", "backslashreplace").decode()
+
+
+def page(found):
+    """The page of the documentation: a line for each row."""
+    head = [
+        "# What goes wrong, and what is said",
+        "",
+        "Every fault is one line on standard error. Exit status: 0 fine, 1 a gate failed, 2 bad input or usage or",
+        "something that the machine lacks, 70 an error of btfref itself, whose details are in the file that the line",
+        "names, 130 interrupted, 141 the reader of the output left, 143 terminated.",
+        "",
+        "`pytest tests/unit/commands/test_faults.py` runs all of these commands and makes this table.",
+        "",
+        "| | fault | command `btfref …` | status | line |",
+        "|---|---|---|---|---|",
+    ]
+    rows = [
+        f"| {row.item} | {row.fault} | `{_ascii(row.command)}` | {status} | {line} |"
+        for row, status, line in found
+    ]
+    return "\n".join([*head, *rows, ""])
