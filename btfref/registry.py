@@ -59,10 +59,20 @@ class Catalogue:
         InputError
             When there is none.
         """
+        return imported(self.place(name))
+
+    def place(self, name: str) -> str:
+        """``"module:object"`` of that name.
+
+        Raises
+        ------
+        InputError
+            When there is none.
+        """
         if name in self.rows:
-            return imported(self.rows[name])
+            return self.rows[name]
         for point in entry_points(group=self.group, name=name):
-            return point.load()
+            return point.value
         raise InputError(
             f"unknown {self.kind}",
             field=self.kind,

@@ -102,7 +102,7 @@ def sampling_gates(
         weights.append(weight)
         pdfs.append(pdf)
     detail = "; ".join(failed) or f"{len(places)} tests of {samples} samples"
-    rejected = Measured(len(failed), "fail" if failed else "pass", detail)
+    rejected = Measured(len(failed), None, detail)
     return [
         *judge("chi2.rejected", {"tests": rejected}),
         *judge("sample.weight", {"max": max(weights)}),
