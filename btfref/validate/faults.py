@@ -102,6 +102,8 @@ FAULTS = (
         ),
     ),
     Fault("sRGB read as linear", "image.eight_bit.code_p999", "eight_bits", change="linear"),
+    Fault("the definition a hundredth too bright", PROBE, "evaluators", change="numpy"),
+    Fault("a Dr.Jit port's evaluation a hundredth too bright", PROBE, "evaluators", change="drjit"),
     Fault("float16 overflow", "probe.finite.nonfinite", "overflow", "svd", change="overflow"),
     Fault(
         "negative values clamped",

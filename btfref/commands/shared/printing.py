@@ -8,6 +8,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from btfref.commands.shared.stdout import stdout
+
 if TYPE_CHECKING:
     from btfref.gates import GateResult
     from btfref.representations.protocol import Representation
@@ -15,9 +17,9 @@ if TYPE_CHECKING:
 
 def emit(text: str = "", *, flush: bool = False) -> None:
     """Write one line to standard output; `flush` before work that takes long or writes by itself."""
-    sys.stdout.write(f"{text}\n")
+    stdout().write(f"{text}\n")
     if flush:
-        sys.stdout.flush()
+        stdout().flush()
 
 
 def emit_json(data: object) -> None:
