@@ -219,6 +219,6 @@ def representation_for(
     facts = {
         "fit": found.key,
         "btf": digest(Path(btf), ""),
-        "code": code_of("btfref.validate.fits", found.key),
+        "code": code_of("btfref.validate.stages.fits", found.key),
     }
     return Cache(cache).get(key_of(facts), f".{found.key}.exr", save_fit)

@@ -18,9 +18,9 @@ from btfref.errors import BtfrefError, InputError
 from btfref.gates.verdicts import missing_reference
 from btfref.validate.cache import Cache
 from btfref.validate.cell import CellResult, failed_cell, gate_from, make_cell
-from btfref.validate.checks import make_checks
-from btfref.validate.drawn import code_of, found, recall
-from btfref.validate.fits import make_fit
+from btfref.validate.stages.checks import make_checks
+from btfref.validate.stages.drawn import code_of, found, recall
+from btfref.validate.stages.fits import make_fit
 from btfref.validate.material import make_material
 from btfref.validate.matrix import FULL, Settings
 from btfref.validate.pictures import make_carrier, make_views
@@ -150,7 +150,7 @@ def validate(
     # Before any process loads code: what changes after that is seen to have changed.
     code = code_of("btfref.validate.cell", *{spec.method for spec in specs})
     for one in sorted({spec.method for spec in specs}):
-        code_of("btfref.validate.checks", one)
+        code_of("btfref.validate.stages.checks", one)
     results, computed, done = [], 0, 0
     report(0, total, "validating")
     with _pool(workers) as pool:

@@ -18,16 +18,16 @@ from btfref.errors import BtfrefError
 from btfref.gates.tolerances import gate_table, limits
 from btfref.gates.verdicts import with_class
 from btfref.platform import shader_directory
-from btfref.validate.edits import EDITS, copied
-from btfref.validate.fault_bench import Bench
-from btfref.validate.faults import FAULTS
+from btfref.validate.injected.edits import EDITS, copied
+from btfref.validate.injected.bench import Bench
+from btfref.validate.injected.faults import FAULTS
 
 if TYPE_CHECKING:
     from btfref.gates.verdicts import GateResult
     from btfref.representations.protocol import Representation
     from btfref.types import Facts, PathLike, Progress
-    from btfref.validate.edits import Edit
-    from btfref.validate.faults import Fault
+    from btfref.validate.injected.edits import Edit
+    from btfref.validate.injected.faults import Fault
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def self_test(*, edits: Sequence[Edit] = EDITS, progress: Progress | None = None
 
     Parameters
     ----------
-    edits : sequence of btfref.validate.edits.Edit
+    edits : sequence of btfref.validate.injected.edits.Edit
         Faults that edit code, each a process of its own.
     progress : callable, optional
         Called as ``progress(done, total, label)``.

@@ -6,7 +6,7 @@ import pytest
 
 from btfref.cli import main
 from btfref.gates import tolerance
-from btfref.validate.faults import FAULTS
+from btfref.validate.injected.faults import FAULTS
 from btfref.validate.self_test import entries, self_test, used_gates
 
 pytestmark = pytest.mark.usefixtures("renderers")

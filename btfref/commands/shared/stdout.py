@@ -79,7 +79,7 @@ def _number(stream: TextIO) -> int | None:
 
 
 def _reopened(number: int, like: TextIO) -> TextIO:
-    return open(  # noqa: SIM115 - closed where standard output is given back, or with the process
+    return open(
         number,
         "w",
         encoding=like.encoding,

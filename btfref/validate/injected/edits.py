@@ -44,7 +44,8 @@ _GUEST = {
     "btfref_guest/__init__.py": """\
 from btfref.registry import Method
 
-METHOD = Method("guest", "A guest", "none", "btfref_guest.definition", "btfref_guest.port", "guest.glsl", "btfref_guest")
+HOME = "btfref_guest"
+METHOD = Method("guest", "A guest", "none", "btfref_guest.definition", "btfref_guest.port", "guest.glsl", HOME)
 """,
     "btfref_guest/definition.py": """\
 from btfref.representations.tabulated import svd
@@ -186,7 +187,7 @@ class Copy:
         from btfref.platform import shader_directory
 
         self.folder, self.cache = Path(folder) / "site", Path(folder) / "cache"
-        root = Path(__file__).resolve().parents[2]
+        root = Path(__file__).resolve().parents[3]
         leave = shutil.ignore_patterns("__pycache__", "docs", "_shaders")
         for package in PACKAGES:
             shutil.copytree(root / package, self.folder / package, ignore=leave)
@@ -206,7 +207,7 @@ class Copy:
         """
         out = self.folder.parent / "outcome.json"
         out.unlink(missing_ok=True)
-        call = f"from btfref.validate.edits import _validate; _validate({[str(self.cache), str(out), *methods]!r})"
+        call = f"from btfref.validate.injected.edits import _validate; _validate({[str(self.cache), str(out), *methods]!r})"
         path = os.pathsep.join([str(self.folder), *filter(None, [os.environ.get("PYTHONPATH")])])
         done = subprocess.run(
             [sys.executable, "-c", call],

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from btfref.representations.protocol import Representation
     from btfref.sampling import SampledBTF
     from btfref.types import JitArray
-    from btfref.validate.faults import Fault, Subject
+    from btfref.validate.injected.faults import Fault, Subject
 
 
 #: The picture of the faults of the host: a curved surface seen from both sides, and more than one light.

@@ -18,7 +18,7 @@ class Fault:
     meant : str
         The limit that must fail: gate and entry.
     look : str
-        Method of `btfref.validate.fault_bench.Bench` that looks for faults of this kind and returns gates.
+        Method of `btfref.validate.injected.bench.Bench` that looks for faults of this kind and returns gates.
     method : str
         Registry key of what is looked at.
     edit : tuple of str, optional
