@@ -21,10 +21,10 @@ from btfref.images.display import Display, fit_display
 from btfref.numerics.colour import decode_srgb
 from btfref.scene.shipped import scene_file
 from btfref.validate.cache import key_of
-from btfref.validate.stages.drawn import code_of
-from btfref.validate.stages.fits import fit_key
 from btfref.validate.matrix import ENVIRONMENTS
 from btfref.validate.pictures import fitted, make_views, shared_settings, views_key
+from btfref.validate.stages.drawn import code_of
+from btfref.validate.stages.fits import fit_key
 
 if TYPE_CHECKING:
     from btfref.comparison import Comparison

@@ -11,10 +11,10 @@ import numpy as np
 from btfref.scene.files import scene_facts
 from btfref.scene.shipped import scene_file
 from btfref.validate.cache import key_of
-from btfref.validate.stages.drawn import code_of
-from btfref.validate.stages.fits import fit_key, make_fit
 from btfref.validate.material import load_material, make_material, material_key
 from btfref.validate.matrix import ENVIRONMENTS, LIGHTS
+from btfref.validate.stages.drawn import code_of
+from btfref.validate.stages.fits import fit_key, make_fit
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -18,12 +18,12 @@ from btfref.errors import BtfrefError, InputError
 from btfref.gates.verdicts import missing_reference
 from btfref.validate.cache import Cache
 from btfref.validate.cell import CellResult, failed_cell, gate_from, make_cell
-from btfref.validate.stages.checks import make_checks
-from btfref.validate.stages.drawn import code_of, found, recall
-from btfref.validate.stages.fits import make_fit
 from btfref.validate.material import make_material
 from btfref.validate.matrix import FULL, Settings
 from btfref.validate.pictures import make_carrier, make_views
+from btfref.validate.stages.checks import make_checks
+from btfref.validate.stages.drawn import code_of, found, recall
+from btfref.validate.stages.fits import make_fit
 
 if TYPE_CHECKING:
     from btfref.gates.verdicts import GateResult

@@ -18,8 +18,8 @@ from btfref.errors import BtfrefError
 from btfref.gates.tolerances import gate_table, limits
 from btfref.gates.verdicts import with_class
 from btfref.platform import shader_directory
-from btfref.validate.injected.edits import EDITS, copied
 from btfref.validate.injected.bench import Bench
+from btfref.validate.injected.edits import EDITS, copied
 from btfref.validate.injected.faults import FAULTS
 
 if TYPE_CHECKING:

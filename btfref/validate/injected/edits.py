@@ -207,7 +207,8 @@ class Copy:
         """
         out = self.folder.parent / "outcome.json"
         out.unlink(missing_ok=True)
-        call = f"from btfref.validate.injected.edits import _validate; _validate({[str(self.cache), str(out), *methods]!r})"
+        arguments = [str(self.cache), str(out), *methods]
+        call = f"from btfref.validate.injected.edits import _validate; _validate({arguments!r})"
         path = os.pathsep.join([str(self.folder), *filter(None, [os.environ.get("PYTHONPATH")])])
         done = subprocess.run(
             [sys.executable, "-c", call],

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 from btfref.comparison.comparison import json_safe
 from btfref.gates.verdicts import judged
 from btfref.validate.cache import key_of
-from btfref.validate.stages.drawn import code_of
-from btfref.validate.stages.fits import fit_key, make_fit
 from btfref.validate.held_out import held_out_error
 from btfref.validate.material import load_material, make_material
+from btfref.validate.stages.drawn import code_of
+from btfref.validate.stages.fits import fit_key, make_fit
 
 if TYPE_CHECKING:
     from btfref.types import Facts
