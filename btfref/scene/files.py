@@ -46,6 +46,8 @@ def scene_files(scene: PathLike, parameters: Mapping[str, str] | None = None) ->
     try:
         for path, node in nodes(file, values, given):
             found.add(path)
+            if node.tag == "default":
+                continue
             texts = [filled(text, values | given) for text in node.attrib.values()]
             named.update((path.parent, text) for text in texts if text)
             if node.tag == "path":
