@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 from btfref.errors import InputError
 from btfref.gates.tolerances import gate_table, limits
@@ -124,7 +124,12 @@ class GateResult:
             "bounds": None if found.bounds is None else list(found.bounds),
             "class": self.pixel_class,
             "detail": self.detail,
+            "beside": {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _JUDGED},
         }
+
+
+#: What a verdict consists of; what else a result carries is told beside it, whatever the verdict.
+_JUDGED = ("name", "passed", "value", "limit", "reason", "outcome", "pixel_class", "detail", "measured")
 
 
 @dataclass(frozen=True)
@@ -221,7 +226,8 @@ def judged(facts: Facts) -> GateResult:
         facts["detail"],
         None if bounds is None else (float(bounds[0]), float(bounds[1])),
     )
-    return _apply(facts["name"], measured, wanted[entry], table["reason"], facts["class"])
+    found = _apply(facts["name"], measured, wanted[entry], table["reason"], facts["class"])
+    return replace(found, **facts["beside"])
 
 
 def deciding(gates: Iterable[GateResult]) -> GateResult | None:

@@ -1,0 +1,140 @@
+"""No verdict outlives what it was made from: edited code, tampered results, other limits."""
+
+import json
+import shutil
+
+import pytest
+
+from btfref.gates import tolerances
+from btfref.registry import methods
+from btfref.validate.injected.edits import EDITS, SETTINGS, VIEW
+from btfref.validate.matrix import Spec
+from btfref.validate.run import validate
+from btfref.validate.self_test import edit_test
+
+pytestmark = pytest.mark.usefixtures("renderers")
+
+#: A fast fit.
+METHOD = "svd"
+
+
+def run(cache):
+    mesostructure, scene, lights = VIEW
+    spec = Spec(mesostructure, METHOD, scene, lights)
+    return validate([spec], settings=SETTINGS, cache=cache, workers=1)
+
+
+@pytest.fixture(scope="module")
+def green(tmp_path_factory):
+    """A cache that a run without failures has filled."""
+    cache = tmp_path_factory.mktemp("green") / "cache"
+    found = run(cache)
+    assert [(name, gate.line) for name, gate in found.failed_gates] == []
+    assert found.computed == found.jobs == 3
+    return cache
+
+
+@pytest.fixture
+def cache(green, tmp_path):
+    return shutil.copytree(green, tmp_path / "cache")
+
+
+def entry(cache, suffix):
+    (path,) = cache.glob(f"*{suffix}")
+    return path
+
+
+def test_what_is_there_is_not_computed_again(cache):
+    before = sorted((path.name, path.stat().st_mtime_ns) for path in cache.iterdir())
+    found = run(cache)
+    assert found.passed
+    assert found.computed == 0
+    assert sorted((path.name, path.stat().st_mtime_ns) for path in cache.iterdir()) == before
+
+
+def empty(path):
+    path.write_bytes(b"")
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def flipped(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0x10
+    path.write_bytes(bytes(data))
+
+
+@pytest.mark.parametrize("tampering", [empty, cut, flipped])
+def test_nine_tamperings(cache, tampering):
+    """Pictures that cells share, the cell, the method's checks: what is broken is made again, and nothing else."""
+    for suffix in (".views.npz", ".cell.npz", ".checks.json"):
+        path = entry(cache, suffix)
+        tampering(path)
+        kept = {p.name: p.stat().st_mtime_ns for p in cache.iterdir() if not p.name.startswith(path.name)}
+        found = run(cache)
+        assert found.passed
+        assert found.computed == 1
+        assert {p.name: p.stat().st_mtime_ns for p in cache.iterdir() if p.name in kept} == kept
+
+
+def test_numbers_that_somebody_wrote_are_measured_again(cache):
+    path = entry(cache, ".checks.json")
+    facts = json.loads(path.read_text("utf-8"))
+    for gate in facts["measured"]:
+        gate["value"] = 123456
+    path.write_text(json.dumps(facts), "utf-8")
+    found = run(cache)
+    assert found.computed == 1
+    assert found.passed
+    assert all(gate["value"] != 123456 for gate in found.methods[0]["gates"])
+
+
+@pytest.mark.parametrize("suffix", [".0.btf.zarr", f".{METHOD}.exr"])
+def test_materials_and_fits_are_verified(cache, suffix):
+    path = entry(cache, suffix)
+    largest = max((p for p in [path, *path.rglob("*")] if p.is_file()), key=lambda p: p.stat().st_size)
+    before = largest.read_bytes()
+    flipped(largest)
+    assert run(cache).computed == 1
+    assert largest.read_bytes() == before
+
+
+def test_verdicts_are_found_by_the_limits_of_today(cache, monkeypatch):
+    """Stored numbers alone: a limit that they do not meet fails them without anything being measured."""
+    strict = {key: dict(gate) for key, gate in tolerances._gates().items()}
+    strict["sample.weight"]["max"] = 0.0
+    strict["image.noise_free"]["max"] = 0.0
+    monkeypatch.setattr(tolerances, "_gates", lambda: strict)
+    found = run(cache)
+    assert found.computed == 0
+    assert {gate.name for _, gate in found.failed_gates} == {"sample.weight.max", "image.noise_free.max"}
+
+
+def test_several_processes_count_what_they_compute(cache):
+    entry(cache, ".cell.npz").unlink()
+    mesostructure, _, lights = VIEW
+    specs = [Spec(mesostructure, METHOD, scene, lights) for scene in ("plane", VIEW[1])]
+    found = validate(specs, settings=SETTINGS, cache=cache, workers=2)
+    # The views of the plane and both cells, in one job; the material and the other views are there.
+    assert (found.computed, found.jobs) == (2, 4)
+    assert validate(specs, settings=SETTINGS, cache=cache, workers=2).computed == 0
+
+
+def caught(edits):
+    return [
+        (found.name, found.meant, found.failed, found.clean) for found in edit_test(edits) if not found.caught
+    ]
+
+
+def test_an_edited_port_is_computed_anew_and_fails():
+    """What passed from the cache before: a factor in the port that a method shares with another."""
+    assert caught(EDITS[:1]) == []
+
+
+@pytest.mark.long
+def test_every_edit_is_computed_anew_and_fails():
+    assert len(EDITS) == 7
+    assert {edit.method for edit in EDITS} - {"guest"} <= set(methods())
+    assert caught(EDITS[1:]) == []
