@@ -13,7 +13,7 @@ from btfref.gates.verdicts import GateResult, Measured, judge
 from btfref.stress.evaluators import EVALUATORS, PORTS, evaluator, surface
 from btfref.stress.judging import port_agreement
 from btfref.stress.lookups import USUAL, hard_lookups, unit
-from btfref.validate.sampling import chi_square
+from btfref.validate.sampling import INTERVALS, chi_square
 
 if TYPE_CHECKING:
     from btfref.types import JitArray, PathLike
@@ -68,7 +68,11 @@ def _named(gate: GateResult, whose: str) -> GateResult:
 
 
 def sampling_gates(
-    path: PathLike, *, samples: int, altered: Callable[[JitArray], JitArray] | None = None
+    path: PathLike,
+    *,
+    samples: int,
+    intervals: int = INTERVALS,
+    altered: Callable[[JitArray], JitArray] | None = None,
 ) -> list[GateResult]:
     """χ² of `sample()` against `pdf()`, and its weights against value over density.
 
@@ -78,6 +82,8 @@ def sampling_gates(
         A representation.
     samples : int
         Of each of the tests; their significance is Šidák-corrected.
+    intervals : int
+        As of :func:`btfref.validate.sampling.chi_square`.
     altered : callable, optional
         ``plugin -> plugin``: a fault.
 
@@ -95,7 +101,9 @@ def sampling_gates(
     pdfs: list[float] = []
     places = [(name, unit(view), uv) for name, view in VIEWS.items() for uv in UVS]
     for name, w_view, uv in places:
-        right, message = chi_square(mi, plugin, uv, w_view, samples=samples, tests=len(places))
+        right, message = chi_square(
+            mi, plugin, uv, w_view, samples=samples, intervals=intervals, tests=len(places)
+        )
         if not right:
             failed.append(f"{name} view, uv {uv}: {message}")
         weight, pdf = _weights(mi, plugin, uv, w_view)

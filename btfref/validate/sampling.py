@@ -29,6 +29,7 @@ def chi_square(
     *,
     samples: int,
     tests: int = 1,
+    intervals: int = INTERVALS,
     pdf_view: ArrayLike | None = None,
     counts: Callable[[JitArray, JitArray, JitArray], JitArray] | None = None,
 ) -> tuple[bool, str]:
@@ -44,6 +45,8 @@ def chi_square(
     samples : int
     tests : int
         That are made together: the level is Šidák-corrected by their number.
+    intervals : int
+        Along each side of a cell of the test's table, over which the density is integrated.
     pdf_view : array_like, shape (3,), optional
         View of the density where it is another, which must be found out.
     counts : callable, optional
@@ -75,7 +78,7 @@ def chi_square(
         pdf_func=pdf,
         sample_dim=3,
         sample_count=samples,
-        ires=INTERVALS,
+        ires=intervals,
     )
     # A test that fails writes its tables where it stands.
     with tempfile.TemporaryDirectory() as scratch, chdir(scratch):

@@ -32,6 +32,9 @@ def own_stdout(*, restore: bool = True) -> Iterator[TextIO]:
     file
     """
     before = sys.stdout
+    if before is None or sys.stderr is None:  # a process without them
+        yield before
+        return
     before.flush()
     saved = _kept(1)
     # A caller that put another object there (a test, a notebook) reads that.

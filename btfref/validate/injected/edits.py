@@ -27,7 +27,15 @@ if TYPE_CHECKING:
 
 #: Small enough for seconds a method.
 SETTINGS = replace(
-    QUICK, texels=8, spp=4, size=24, truth_spp=16, held_out_texels=4, chi2_samples=50_000, port_pixels=16
+    QUICK,
+    texels=8,
+    spp=4,
+    size=24,
+    truth_spp=16,
+    held_out_texels=4,
+    chi2_samples=50_000,
+    chi2_intervals=8,
+    port_pixels=16,
 )
 
 #: The views that every method is shown in: mesostructure, scene, lights.

@@ -33,7 +33,7 @@ def make_checks(cache: Cache, mesostructure: str, method: str, settings: Setting
         {
             "checks": fit_key(mesostructure, method, settings),
             "code": code_of(__name__, method),
-            "samples": settings.chi2_samples,
+            "samples": [settings.chi2_samples, settings.chi2_intervals],
             "held_out_texels": settings.held_out_texels,
         }
     )
@@ -53,7 +53,8 @@ def _measured(cache: Cache, mesostructure: str, key: str, settings: Settings) ->
 
     start = time.perf_counter()
     file = make_fit(cache, mesostructure, key, settings)
-    gates = [*probe_gates(file), *sampling_gates(file, samples=settings.chi2_samples)]
+    gates = probe_gates(file)
+    gates += sampling_gates(file, samples=settings.chi2_samples, intervals=settings.chi2_intervals)
     btf = load_material(make_material(cache, mesostructure, settings)[0])
     error = held_out_error(method(key).fit, btf, texels=settings.held_out_texels)
     info = read_info(file)
