@@ -6,8 +6,9 @@ import shutil
 import pytest
 
 from btfref.gates import tolerances
+from btfref.provenance import code
 from btfref.registry import methods
-from btfref.validate.injected.edits import EDITS, SETTINGS, VIEW
+from btfref.validate.injected.edits import EDITS, SETTINGS, VIEW, copied
 from btfref.validate.matrix import Spec
 from btfref.validate.run import validate
 from btfref.validate.self_test import edit_test
@@ -122,19 +123,35 @@ def test_several_processes_count_what_they_compute(cache):
     assert validate(specs, settings=SETTINGS, cache=cache, workers=2).computed == 0
 
 
-def caught(edits):
-    return [
-        (found.name, found.meant, found.failed, found.clean) for found in edit_test(edits) if not found.caught
-    ]
+#: Modules that make results, and those that only call them.
+STAGES = ("material", "stages.fits", "pictures", "cell", "stages.checks")
+CALLERS = {"btfref.validate.run", "btfref.validate.injected", "btfref.validate.injected.edits"}
 
 
 def test_an_edited_port_is_computed_anew_and_fails():
     """What passed from the cache before: a factor in the port that a method shares with another."""
-    assert caught(EDITS[:1]) == []
+    edit = EDITS[0]
+    with copied() as copy:
+        clean = copy.run([edit.method])
+        with copy.edited(edit):
+            found = copy.run([edit.method])
+    assert clean.failed == ()
+    assert clean.computed == clean.jobs == 3
+    assert found.computed == 1
+    assert edit.meant in found.failed
+
+    # Nothing was run that the keys of the results do not hold.
+    methods = edit.method, "svd", "raw"  # the latter two make the views
+    stages = [code.closure(f"btfref.validate.{stage}", methods) for stage in STAGES]
+    files = {path for stage in stages for path in stage.files}
+    assert len(clean.loaded) > 100
+    strange = {name for name in clean.loaded if code.module_file(name) not in files}
+    assert strange - CALLERS == set()
 
 
 @pytest.mark.long
 def test_every_edit_is_computed_anew_and_fails():
     assert len(EDITS) == 7
     assert {edit.method for edit in EDITS} - {"guest"} <= set(methods())
-    assert caught(EDITS[1:]) == []
+    found = list(edit_test(EDITS))
+    assert [(one.name, one.failed, one.clean) for one in found if not one.caught] == []

@@ -175,11 +175,14 @@ class Outcome:
     computed, jobs : int
     failed : tuple of str
         Limits that failed.
+    loaded : tuple of str
+        Modules of the packages that the process loaded.
     """
 
     computed: int
     jobs: int
     failed: tuple[str, ...]
+    loaded: tuple[str, ...] = ()
 
 
 class Copy:
@@ -230,7 +233,7 @@ class Copy:
             said = (done.stderr.strip() or "no word").splitlines()[-1]
             raise BtfrefError(f"a validation in a copy of the packages failed: {said}")
         found = json.loads(out.read_text("utf-8"))
-        return Outcome(found["computed"], found["jobs"], tuple(found["failed"]))
+        return Outcome(found["computed"], found["jobs"], tuple(found["failed"]), tuple(found["loaded"]))
 
     @contextmanager
     def edited(self, edit: Edit) -> Iterator[None]:
@@ -265,7 +268,8 @@ def _validate(arguments: Sequence[str]) -> None:
     specs = [Spec(mesostructure, method, scene, lights) for method in methods]
     found = validate(specs, settings=SETTINGS, cache=cache, workers=1)
     failed = sorted({gate.name for _, gate in found.failed_gates})
-    facts: Facts = {"computed": found.computed, "jobs": found.jobs, "failed": failed}
+    loaded = sorted(name for name in sys.modules if name.split(".")[0] in PACKAGES)
+    facts: Facts = {"computed": found.computed, "jobs": found.jobs, "failed": failed, "loaded": loaded}
     Path(out).write_text(json.dumps(facts), "utf-8")
 
 
