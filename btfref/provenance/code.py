@@ -17,7 +17,7 @@ import sys
 import sysconfig
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -104,7 +104,7 @@ def closure(root: str, methods: tuple[str, ...] = (), places: tuple[str, ...] = 
 class _Search:
     """Modules by the names that are taken from them, until no new ones are found."""
 
-    def __init__(self, rows: list[Method], places: Iterable[str]) -> None:
+    def __init__(self, rows: Sequence[Method], places: Iterable[str]) -> None:
         self.rows = rows
         self.used: dict[str, set[str]] = defaultdict(set)
         self.run: set[str] = set()
@@ -127,7 +127,8 @@ class _Search:
                 if target == what:
                     raise ModuleNotFoundError(f"no file of module {what.module!r}", name=what.module)
                 continue
-            open_ += self._run(target.module)
+            # A package that only hands a name on is run all the same.
+            open_ += [*self._run(wanted.module), *self._run(target.module)]
             if target.name in self.used[target.module]:
                 continue
             new = not self.used[target.module]
@@ -153,7 +154,6 @@ class _Search:
         if file is not None and wanted.name:
             text = imports.read(file, wanted.module)
             if text.lazy and wanted.name in text.homes:
-                self.run.add(wanted.module)
                 return self._home(text.homes[wanted.name])
         return wanted
 

@@ -131,18 +131,20 @@ def test_imports_of_every_kind(package):
             "if TYPE_CHECKING:\n    from others.typed import T\nelse:\n    import others.run\n"
             "class C:\n    def f(self):\n        with open('x'):\n            from others.inner import y\n"
             "ROWS = {'a': 'others.table:row'}\n",
-            "lazy/__init__.py": "from typing import TYPE_CHECKING\n"
+            "lazy/__init__.py": "from typing import TYPE_CHECKING\nimport others.at_once\n"
             "if TYPE_CHECKING:\n    from others.home import Asked\n    from others.other_home import Other\n"
             "def __getattr__(name):\n    return 1\n",
             **{
                 f"{name}.py": ""
                 for name in (
-                    "plain named beside tried handled typed run inner table home other_home left_out".split()
-                )
+                    "plain named beside tried handled typed run inner table home other_home left_out at_once"
+                ).split()
             },
         }
     )
-    expected = "__init__ start plain named beside lazy/__init__ tried handled run inner table home".split()
+    expected = (
+        "__init__ start plain named beside lazy/__init__ at_once tried handled run inner table home".split()
+    )
     assert found(files, "others.start") == {f"{name}.py" for name in expected}
 
 
