@@ -92,11 +92,11 @@ class Cache:
         self.computed += 1
         seal = path.with_name(path.name + SEAL)
         _remove(seal)
-        if path.is_dir():
-            _remove(path)
         with new_file(path) as draft:
             save(draft)
             value = None if code.changed() else digest(draft, path.name)
+            if path.is_dir() or draft.is_dir():  # only files take each other's place
+                _remove(path)
         if value is not None:
             with new_file(seal) as draft:
                 draft.write_text(value, "utf-8")

@@ -4,6 +4,7 @@ import copy
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import jsonschema
 import numpy as np
@@ -100,6 +101,15 @@ def test_what_was_tampered_with_is_made_again(tmp_path, tampering, kind):
     assert again.computed == 1
     assert target.read_bytes() == b"what was measured, 0123456789"
     assert Cache(tmp_path).has("key", ".json")
+
+
+def test_a_file_takes_the_place_of_a_folder_and_the_other_way_round(tmp_path):
+    for kind, there in (("file", Path.mkdir), ("folder", Path.touch)):
+        path = Cache(tmp_path).path(kind, ".x")
+        there(path)
+        Cache(tmp_path).get(kind, ".x", lambda path, kind=kind: _entry(path, kind))
+        assert Cache(tmp_path).has(kind, ".x")
+        assert path.is_dir() == (kind == "folder")
 
 
 def test_a_seal_is_of_its_own_entry(tmp_path):
