@@ -8,7 +8,7 @@ import pytest
 from btfref.gates import tolerances
 from btfref.provenance import code
 from btfref.registry import methods
-from btfref.validate.injected.edits import EDITS, SETTINGS, VIEW, copied
+from btfref.validate.injected.edits import EDITS, GUEST, SETTINGS, VIEW, copied
 from btfref.validate.matrix import Spec
 from btfref.validate.run import validate
 from btfref.validate.self_test import edit_test
@@ -67,39 +67,43 @@ def flipped(path):
     path.write_bytes(bytes(data))
 
 
-@pytest.mark.parametrize("tampering", [empty, cut, flipped])
-def test_nine_tamperings(cache, tampering):
-    """Pictures that cells share, the cell, the method's checks: what is broken is made again, and nothing else."""
-    for suffix in (".views.npz", ".cell.npz", ".checks.json"):
-        path = entry(cache, suffix)
-        tampering(path)
-        kept = {p.name: p.stat().st_mtime_ns for p in cache.iterdir() if not p.name.startswith(path.name)}
-        found = run(cache)
-        assert found.passed
-        assert found.computed == 1
-        assert {p.name: p.stat().st_mtime_ns for p in cache.iterdir() if p.name in kept} == kept
+@pytest.mark.parametrize("turn", range(3))
+def test_nine_tamperings(cache, turn):
+    """Pictures that cells share, a cell, a method's checks, each in three ways: made again, and nothing else."""
+    suffixes, tamperings = (".views.npz", ".cell.npz", ".checks.json"), (empty, cut, flipped)
+    paths = [entry(cache, suffix) for suffix in suffixes]
+    for place, path in enumerate(paths):
+        tamperings[(place + turn) % 3](path)
+    broken = [path.read_bytes() for path in paths]
+    stems = tuple(path.name for path in paths)
+    kept = {p.name: p.stat().st_mtime_ns for p in cache.iterdir() if not p.name.startswith(stems)}
+    found = run(cache)
+    assert found.passed
+    assert found.computed == 2  # the views, and the method with its cell and its checks
+    assert all(path.read_bytes() != bytes_ for path, bytes_ in zip(paths, broken, strict=True))
+    assert {p.name: p.stat().st_mtime_ns for p in cache.iterdir() if p.name in kept} == kept
 
 
-def test_numbers_that_somebody_wrote_are_measured_again(cache):
-    path = entry(cache, ".checks.json")
-    facts = json.loads(path.read_text("utf-8"))
+def test_materials_fits_and_written_numbers_are_made_again(cache):
+    """And numbers that somebody wrote into the checks, large ones, which a stored verdict would have let through."""
+    checks = entry(cache, ".checks.json")
+    facts = json.loads(checks.read_text("utf-8"))
     for gate in facts["measured"]:
         gate["value"] = 123456
-    path.write_text(json.dumps(facts), "utf-8")
+    checks.write_text(json.dumps(facts), "utf-8")
+    largest = []
+    for suffix in (".0.btf.zarr", f".{METHOD}.exr"):
+        path = entry(cache, suffix)
+        files = [p for p in [path, *path.rglob("*")] if p.is_file()]
+        largest.append(max(files, key=lambda p: p.stat().st_size))
+    before = [path.read_bytes() for path in largest]
+    for path in largest:
+        flipped(path)
     found = run(cache)
-    assert found.computed == 1
     assert found.passed
+    assert found.computed == 2
     assert all(gate["value"] != 123456 for gate in found.methods[0]["gates"])
-
-
-@pytest.mark.parametrize("suffix", [".0.btf.zarr", f".{METHOD}.exr"])
-def test_materials_and_fits_are_verified(cache, suffix):
-    path = entry(cache, suffix)
-    largest = max((p for p in [path, *path.rglob("*")] if p.is_file()), key=lambda p: p.stat().st_size)
-    before = largest.read_bytes()
-    flipped(largest)
-    assert run(cache).computed == 1
-    assert largest.read_bytes() == before
+    assert [path.read_bytes() for path in largest] == before
 
 
 def test_verdicts_are_found_by_the_limits_of_today(cache, monkeypatch):
@@ -113,6 +117,7 @@ def test_verdicts_are_found_by_the_limits_of_today(cache, monkeypatch):
     assert {gate.name for _, gate in found.failed_gates} == {"sample.weight.max", "image.noise_free.max"}
 
 
+@pytest.mark.long
 def test_several_processes_count_what_they_compute(cache):
     entry(cache, ".cell.npz").unlink()
     mesostructure, _, lights = VIEW
@@ -129,8 +134,7 @@ CALLERS = {"btfref.validate.run", "btfref.validate.injected", "btfref.validate.i
 
 
 def test_an_edited_port_is_computed_anew_and_fails():
-    """What passed from the cache before: a factor in the port that a method shares with another."""
-    edit = EDITS[0]
+    edit = EDITS[-1]  # of the method whose fit is the fastest
     with copied() as copy:
         clean = copy.run([edit.method])
         with copy.edited(edit):
@@ -138,10 +142,11 @@ def test_an_edited_port_is_computed_anew_and_fails():
     assert clean.failed == ()
     assert clean.computed == clean.jobs == 3
     assert found.computed == 1
+    assert edit.method == GUEST
     assert edit.meant in found.failed
 
     # Nothing was run that the keys of the results do not hold.
-    methods = edit.method, "svd", "raw"  # the latter two make the views
+    methods = "svd", "raw"  # the guest's is derived from the one, and both make the views
     stages = [code.closure(f"btfref.validate.{stage}", methods) for stage in STAGES]
     files = {path for stage in stages for path in stage.files}
     assert len(clean.loaded) > 100
