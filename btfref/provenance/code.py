@@ -21,7 +21,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from btfref.provenance import imports
 from btfref.provenance.imports import SHADERS, Imported
@@ -338,8 +338,9 @@ def remembered() -> dict[Path, tuple[tuple[int, int], str]]:
 
 def forget() -> None:
     """Read all code anew at the next question: for those who change some while they run."""
-    for remembered_call in (imports.read, closure, code_of, module_file, is_external, _roots, _bases):
-        remembered_call.cache_clear()
+    remembering: tuple[Any, ...] = (imports.read, closure, code_of, module_file, is_external, _roots, _bases)
+    for function in remembering:
+        function.cache_clear()
     _read.clear()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -90,9 +90,8 @@ def _brighter(representation: Representation) -> Representation:
         return 1.01 * kind.evaluate(self, *arguments, **settings)
 
     kind = type(representation)
-    return type(kind.__name__, (kind,), {"evaluate": evaluate}).from_arrays(
-        representation.arrays(), representation.meta
-    )
+    brighter: Any = type(kind.__name__, (kind,), {"evaluate": evaluate})
+    return brighter.from_arrays(representation.arrays(), representation.meta)
 
 
 class Bench:
