@@ -67,7 +67,7 @@ def flipped(path):
     path.write_bytes(bytes(data))
 
 
-@pytest.mark.parametrize("turn", range(3))
+@pytest.mark.parametrize("turn", [0, *(pytest.param(n, marks=pytest.mark.long) for n in (1, 2))])
 def test_nine_tamperings(cache, turn):
     """Pictures that cells share, a cell, a method's checks, each in three ways: made again, and nothing else."""
     suffixes, tamperings = (".views.npz", ".cell.npz", ".checks.json"), (empty, cut, flipped)
@@ -84,6 +84,7 @@ def test_nine_tamperings(cache, turn):
     assert {p.name: p.stat().st_mtime_ns for p in cache.iterdir() if p.name in kept} == kept
 
 
+@pytest.mark.long
 def test_materials_fits_and_written_numbers_are_made_again(cache):
     """And numbers that somebody wrote into the checks, large ones, which a stored verdict would have let through."""
     checks = entry(cache, ".checks.json")
