@@ -154,7 +154,7 @@ EDITS = (
         GUEST,
         "btfref/stress/lookups.py",
         'uv = _coordinates(rng, coordinate, representation.meta["texels"])',
-        'uv = _coordinates(rng, coordinate, representation.meta["texels"]) + 1e4',
+        'uv = _coordinates(rng, coordinate, representation.meta["texels"]).astype(float) + 1e4',
     ),
     Edit(
         "edit: a port in another's package",
