@@ -192,12 +192,15 @@ class Copy:
     ----------
     folder : path-like
         An empty folder for both.
+    cache : path-like, optional
+        Another cache: what is copied has the keys of the copy.
     """
 
-    def __init__(self, folder: PathLike) -> None:
+    def __init__(self, folder: PathLike, cache: PathLike | None = None) -> None:
         from btfref.platform import shader_directory
 
-        self.folder, self.cache = Path(folder) / "site", Path(folder) / "cache"
+        self.folder = Path(folder) / "site"
+        self.cache = Path(cache).absolute() if cache else Path(folder) / "cache"
         root = Path(__file__).resolve().parents[3]
         leave = shutil.ignore_patterns("__pycache__", "docs", "_shaders")
         for package in PACKAGES:
@@ -274,7 +277,7 @@ def _validate(arguments: Sequence[str]) -> None:
 
 
 @contextmanager
-def copied() -> Iterator[Copy]:
+def copied(cache: PathLike | None = None) -> Iterator[Copy]:
     """A `Copy` in a temporary folder."""
     with tempfile.TemporaryDirectory() as folder:
-        yield Copy(folder)
+        yield Copy(folder, cache)
