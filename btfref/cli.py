@@ -23,6 +23,7 @@ from typing import Any, NoReturn
 from btfref.commands import COMMANDS
 from btfref.commands.shared.paths import check_paths
 from btfref.commands.shared.printing import printable
+from btfref.commands.shared.stdout import own_stdout
 from btfref.errors import BtfrefError, InputError
 from btfref.provenance import __version__
 
@@ -202,15 +203,13 @@ def main(argv: Sequence[str] | None = None) -> int:
                 )
         args = build_parser().parse_args(given)
         check_paths(args, args.outputs)
-        status = args.run(args)
-        sys.stdout.flush()
+        with own_stdout(restore=argv is not None):
+            status = args.run(args)
     except SystemExit as stop:  # argparse: 0 after --help, 2 after a usage error
         return int(stop.code or 0)
     except BtfrefError as error:
         return _complain(error)
     except BrokenPipeError:
-        # The reader (head, less) has left. Point stdout away so that the interpreter's last flush is quiet.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except OSError as error:
         return _complain(_os_error(error))

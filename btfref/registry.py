@@ -124,11 +124,21 @@ class Catalogue:
         InputError
             When there is none, or its package cannot be loaded.
         """
+        return imported(self.place(name))
+
+    def place(self, name: str) -> str:
+        """``"module:object"`` of that name.
+
+        Raises
+        ------
+        InputError
+            When there is none.
+        """
         if name in self.rows:
-            return imported(self.rows[name])
+            return self.rows[name]
         found, broken = usable_points(self.group)
         if name in found:
-            return found[name]
+            return next(point.value for point in entry_points(group=self.group, name=name))
         if name in broken:
             raise InputError(f"a {self.kind} of another package: {broken[name]}", field=self.kind)
         raise InputError(

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from btfref.comparison import Comparison
+    from btfref.types import Facts
 
 #: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
 OUTPUTS = {"report": "page"}
@@ -58,6 +59,7 @@ def run(args: Namespace) -> int:
 
     from btfref.comparison import compare
     from btfref.images import load_image
+    from btfref.rendering.picture import differences, read_picture_facts
 
     test = load_image(args.test)
     if Path(args.reference).suffix.lower() in (".exr", ".png"):
@@ -68,10 +70,13 @@ def run(args: Namespace) -> int:
                 )
         reference = load_image(args.reference)
         classes = load_classes(args.classes) if args.classes else None
+        other = read_picture_facts(args.reference)
         comparison = compare(test, reference, classes=classes, gate=args.gate)
     else:
-        comparison = _against_scene(args, test)
+        comparison, other = _against_scene(args, test)
         reference = np.asarray(comparison.reference, np.float32)
+    own = read_picture_facts(args.test)
+    found = differences(own, other) if own and other else []
     if report:
         from btfref.provenance import versions
         from btfref.report import Cell, write_report
@@ -81,15 +86,18 @@ def run(args: Namespace) -> int:
         facts = {"test": args.test, "reference": args.reference, "versions": versions()}
         write_report(report, title="Comparison", cells=[cell], facts=facts)
     if args.json:
-        emit_json(comparison.to_dict())
+        emit_json({**comparison.to_dict(), "differs": found})
     else:
+        if found:
+            emit(f"differs: {'; '.join(found)}")
         for line in lines(comparison):
             emit(line)
     return 0 if comparison.passed else 1
 
 
-def _against_scene(args: Namespace, test: np.ndarray) -> Comparison:
-    """The comparison with the reference of a scene."""
+def _against_scene(args: Namespace, test: np.ndarray) -> tuple[Comparison, Facts]:
+    """The comparison with the reference of a scene, and what that shows."""
+    from btfref.scene.facts import scene_content
     from btfref.validate.own_renderer import judge_image, reference_of, representation_for
 
     if args.classes:
@@ -97,15 +105,23 @@ def _against_scene(args: Namespace, test: np.ndarray) -> Comparison:
     parameters = assignments(args.define, convert=str, option="-D")
     if args.method:
         parameters["btf"] = str(representation_for(args.method, args.btf, cache=args.cache))
+    size = args.size or (test.shape[1], test.shape[0])
     found = reference_of(
         args.reference,
         parameters=parameters,
-        size=args.size or (test.shape[1], test.shape[0]),
+        size=size,
         grid=args.grid,
         shadows=args.shadows,
         cache=args.cache,
     )
-    return judge_image(args.test, found, gates=args.gate)
+    # Under an environment the reference is a plain rendering of the scene.
+    noisy = found.variance is not None
+    facts = {
+        **scene_content(args.reference, parameters, size=size),
+        "grid": None if noisy else args.grid,
+        "shadows": noisy or args.shadows,
+    }
+    return judge_image(args.test, found, gates=args.gate), facts
 
 
 def lines(comparison: Comparison) -> Iterator[str]:

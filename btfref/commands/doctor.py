@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from btfref.commands.shared.options import add_json
 from btfref.commands.shared.printing import bytes_text, emit, emit_json, printable
+from btfref.commands.shared.stdout import stdout
 from btfref.errors import MissingDependencyError
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def run(args: Namespace) -> int:
     if args.json:
         emit_json(examination.to_dict())
     else:
-        for line in lines(examination, colour=sys.stdout.isatty()):
+        for line in lines(examination, colour=stdout().isatty()):
             emit(line, coloured=True)
     return 0 if examination.ok else 1
 

@@ -132,7 +132,10 @@ def _plain_exr(path: Path) -> bool:
 
 
 def _exr(path: Path) -> Facts:
+    from btfref.rendering.picture import read_picture_facts
+
     headers = _headers(path) or []
+    shown = read_picture_facts(path)
     low, high = (corner.tolist() for corner in headers[0]["dataWindow"])
     return {
         "kind": "image",
@@ -140,6 +143,7 @@ def _exr(path: Path) -> Facts:
         "channels": [channel.name for channel in headers[0]["channels"]],
         "parts": len(headers),
         "file_bytes": path.stat().st_size,
+        **({"picture": shown} if shown else {}),
     }
 
 
@@ -175,6 +179,8 @@ def _short(fact: Facts) -> bool:
 
 
 def _text(key: str, fact: Any) -> str:
+    if isinstance(fact, dict) and fact and not _short(fact):
+        return ", ".join(f"{name} {_text('', entry)}" for name, entry in fact.items())
     if isinstance(fact, dict) and fact:
         shape = fact.get("shape")
         size = f", {bytes_text(fact['bytes'])}" if shape else ""
@@ -190,6 +196,8 @@ def _text(key: str, fact: Any) -> str:
     if key in ("shape", "size") and isinstance(fact, list | tuple):
         return " × ".join(map(str, fact))
     if isinstance(fact, list | tuple):
+        if any(isinstance(entry, dict | list) for entry in fact):
+            return "; ".join(_text("", entry) for entry in fact)
         if len(fact) > MOST_LISTED:
             return f"{len(fact)} values"
         return ", ".join(map(str, fact)) or "none"

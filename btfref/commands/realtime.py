@@ -90,11 +90,13 @@ def transfer_settings(items: Sequence[str]) -> TransferSettings:
 def run(args: Namespace) -> int:
     """Carry the command out."""
     import btfref
+    from btfref.rendering.picture import picture_facts
 
     out = output_file(args.output, ".exr")
+    parameters = assignments(args.define, convert=str, option="-D")
     result = btfref.realtime(
         args.scene,
-        parameters=assignments(args.define, convert=str, option="-D"),
+        parameters=parameters,
         grid=args.grid,
         size=args.size,
         keep=args.keep,
@@ -104,7 +106,8 @@ def run(args: Namespace) -> int:
         window=args.window,
         transfer=transfer_settings(args.transfer) if args.transfer else None,
     )
-    write_images(result.image, out, png=args.png)
+    facts = picture_facts(result, args.scene, parameters=parameters, size=args.size)
+    write_images(result.image, out, facts, png=args.png)
     if args.json:
         emit_json(result.meta)
     else:

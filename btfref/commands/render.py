@@ -53,6 +53,7 @@ def help_text(parser: ArgumentParser, args: Namespace) -> str:
 def run(args: Namespace) -> int:
     """Carry the command out."""
     import btfref
+    from btfref.rendering.picture import picture_facts
 
     out = output_file(args.output, ".exr")
     parameters = assignments(args.define, convert=str, option="-D")
@@ -85,5 +86,6 @@ def run(args: Namespace) -> int:
         from btfref.scene.pixel_classes import pixel_classes
 
         classes = pixel_classes(args.scene, parameters=parameters, size=args.size, grid=args.grid or 4)
-    write_images(result.image, out, png=args.png, classes=classes, classes_out=classes_out)
+    facts = picture_facts(result, args.scene, parameters=parameters, size=args.size)
+    write_images(result.image, out, facts, png=args.png, classes=classes, classes_out=classes_out)
     return 0

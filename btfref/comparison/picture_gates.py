@@ -109,11 +109,11 @@ def _equivalence(t: np.ndarray, r: np.ndarray, variance: np.ndarray, table: Gate
     relative = significance.Interval(
         relative.estimate, relative.standard_error, found.low / scale, found.high / scale, mse.confidence
     )
-    result = significance.equivalence_test(relative, tolerance=table["relative_rmse"])
     return Measured(
         relative.estimate,
-        result.outcome,
+        None,
         f"{100 * mse.confidence:g} % interval {relative.low:.2e} to {relative.high:.2e}",
+        (relative.low, relative.high),
     )
 
 
@@ -135,4 +135,4 @@ def _tiles(comparison: Comparison, variance: np.ndarray, mask: np.ndarray, table
         return Measured(None, "empty", "no tile of which a quarter is of the class")
     worst = found.interval
     detail = f"interval of the worst tile {worst.low:.2e} to {worst.high:.2e}"
-    return Measured(abs(worst.estimate), found.outcome, detail)
+    return Measured(abs(worst.estimate), None, detail, found.bounds)

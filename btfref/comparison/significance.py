@@ -278,11 +278,14 @@ class Equivalence:
         Interval inside ± tolerance; interval wholly outside; neither, so that more samples are needed.
     interval : Interval
     tolerance : float
+    bounds : (float, float) or None
+        Of several quantities, between which the largest surely lies; None for one, whose interval tells.
     """
 
     outcome: str
     interval: Interval
     tolerance: float
+    bounds: tuple[float, float] | None = None
 
     @property
     def passed(self) -> bool:
@@ -397,13 +400,14 @@ def tile_equivalence(
         return None
     half = tile_half_widths(variance, mask, significance=significance, size=size)
     confidence = 1 - sidak(significance, mean.size)
-    if (np.abs(mean) - half > tolerance).any():
+    low, high = (float((np.abs(mean) + sign * half).max()) for sign in (-1, 1))
+    if low > tolerance:
         outcome = "fail"
     else:
-        outcome = "pass" if (np.abs(mean) + half < tolerance).all() else "inconclusive"
+        outcome = "pass" if high < tolerance else "inconclusive"
     place = np.unravel_index(np.abs(mean).argmax(), mean.shape)
     worst = interval(float(mean[place]), float(np.sqrt(spread[place])), confidence=confidence)
-    return Equivalence(outcome, worst, float(tolerance))
+    return Equivalence(outcome, worst, float(tolerance), (low, high))
 
 
 def tile_half_widths(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 from btfref.errors import InputError
 from btfref.gates.tolerances import gate_table, limits
@@ -53,6 +53,8 @@ class GateResult:
         Class judged, empty for gates that are not about pixels.
     detail : str
         What a failure, or an undecided test, needs as explanation.
+    measured : Measured or None
+        What the outcome was judged from; None for a result that nobody measured.
     """
 
     name: str
@@ -63,6 +65,7 @@ class GateResult:
     outcome: str = "pass"
     pixel_class: str = ""
     detail: str = ""
+    measured: Measured | None = None
 
     @property
     def gate(self) -> str:
@@ -110,22 +113,45 @@ class GateResult:
             "detail": self.detail,
         }
 
+    def measurement(self) -> Facts:
+        """What was measured, JSON-able, without any verdict: `judged` finds that anew."""
+        found = self.measured or Measured(self.value)
+        value = found.value if found.value is None or math.isfinite(found.value) else str(found.value)
+        return {
+            "name": self.name,
+            "value": value,
+            "lacks": found.outcome,
+            "bounds": None if found.bounds is None else list(found.bounds),
+            "class": self.pixel_class,
+            "detail": self.detail,
+            "beside": {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _JUDGED},
+        }
+
+
+#: What a verdict consists of; what else a result carries is told beside it, whatever the verdict.
+_JUDGED = ("name", "passed", "value", "limit", "reason", "outcome", "pixel_class", "detail", "measured")
+
 
 @dataclass(frozen=True)
 class Measured:
-    """A number with an outcome already decided by a test, or with the reason why there is no number.
+    """A number, or the reason why there is none.
 
     Parameters
     ----------
     value : float or None
-    outcome : {"pass", "fail", "inconclusive", "empty"} or None
-        None leaves the decision to the limit.
+    outcome : {"fail", "empty"} or None
+        What it means that something is not there: a reference, a variance, pixels of the class. None where the limit
+        decides.
     detail : str
+    bounds : (float, float), optional
+        Between which the value surely lies: it passes where both are within the limit on either side of zero, fails
+        where both are beyond it on one, and is else inconclusive.
     """
 
     value: float | None
     outcome: str | None = None
     detail: str = ""
+    bounds: tuple[float, float] | None = None
 
 
 def judge(
@@ -169,6 +195,41 @@ def judge(
     ]
 
 
+def judged(facts: Facts) -> GateResult:
+    """The verdict on a stored measurement, by the limit as it is now.
+
+    Parameters
+    ----------
+    facts : dict
+        As `GateResult.measurement` gives it.
+
+    Returns
+    -------
+    GateResult
+
+    Raises
+    ------
+    InputError
+        For a gate that there is no more.
+    """
+    gate, _, entry = facts["name"].rpartition(".")
+    table = gate_table(gate)
+    wanted = limits(table)
+    if entry not in wanted:
+        raise InputError(
+            "no such limit", file="tolerances.toml", field=gate, got=entry, expected=list(wanted)
+        )
+    value, bounds = facts["value"], facts["bounds"]
+    measured = Measured(
+        None if value is None else float(value),
+        facts["lacks"],
+        facts["detail"],
+        None if bounds is None else (float(bounds[0]), float(bounds[1])),
+    )
+    found = _apply(facts["name"], measured, wanted[entry], table["reason"], facts["class"])
+    return replace(found, **facts["beside"])
+
+
 def deciding(gates: Iterable[GateResult]) -> GateResult | None:
     """The result that says most of a cell: what failed or is not decided, else what is nearest to its limit."""
     return max(gates, key=lambda gate: (not gate.passed, gate.outcome == "fail", gate.share), default=None)
@@ -209,6 +270,16 @@ def _apply(
     if outcome is None:
         if value is None or math.isnan(value):
             outcome, detail = "fail", detail or "not measured"
+        elif measured.bounds is not None:
+            outcome = _surely(*measured.bounds, limit)
         else:
             outcome = "pass" if (value >= limit if lower else value <= limit) else "fail"
-    return GateResult(name, outcome in ("pass", "empty"), value, limit, reason, outcome, pixel_class, detail)
+    passed = outcome in ("pass", "empty")
+    return GateResult(name, passed, value, limit, reason, outcome, pixel_class, detail, measured)
+
+
+def _surely(low: float, high: float, limit: float) -> str:
+    """Two one-sided tests (Schuirmann 1987) by an interval."""
+    if -limit < low and high < limit:
+        return "pass"
+    return "fail" if low > limit or high < -limit else "inconclusive"

@@ -110,6 +110,31 @@ def save_image(
         raise InputError("unknown kind of picture", file=path, got=repr(path.suffix), expected=".exr or .png")
 
 
+def read_attribute(path: PathLike, name: str) -> str | None:
+    """A text in the header of an OpenEXR file; None for a file without it, or one that cannot be read.
+
+    Parameters
+    ----------
+    path : path-like
+    name : str
+
+    Returns
+    -------
+    str or None
+    """
+    import OpenEXR
+
+    path = Path(path)
+    if not path.is_file() or path.stat().st_size == 0:
+        return None
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            text = file.header().get(name)
+    except Exception:  # the bindings raise several kinds for a broken file
+        return None
+    return text if isinstance(text, str) else None
+
+
 def _load_exr(path: Path) -> np.ndarray:
     try:
         with opened(path) as file:

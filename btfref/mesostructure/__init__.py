@@ -48,6 +48,17 @@ def names() -> list[str]:
     return sorted(_CATALOGUE.names())
 
 
+def place(name: str) -> str:
+    """``"module:function"`` of a registered mesostructure.
+
+    Raises
+    ------
+    InputError
+        When there is none of that name.
+    """
+    return _CATALOGUE.place(name)
+
+
 def build(mesostructure: PathLike | Mesostructure, **parameters: Any) -> Mesostructure:
     """Geometry and materials of a mesostructure.
 

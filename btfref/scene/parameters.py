@@ -35,7 +35,7 @@ def check_parameters(file: Path, parameters: Mapping[str, str]) -> None:
     values: dict[str, str] = {}
     used: set[str] = set()
     try:
-        for path, node in _nodes(file, values, parameters):
+        for path, node in nodes(file, values, parameters):
             if node.tag == "path":  # further folders for files that are included
                 return
             for attribute in node.attrib.values():
@@ -65,7 +65,7 @@ def check_parameters(file: Path, parameters: Mapping[str, str]) -> None:
             )
 
 
-def _nodes(
+def nodes(
     file: Path, values: dict[str, str], parameters: Mapping[str, str]
 ) -> Iterator[tuple[Path, ElementTree.Element]]:
     """Every node of a scene and of what it includes, in order, with its file; ``values`` collects defaults."""
@@ -74,18 +74,19 @@ def _nodes(
             values.setdefault(node.attrib.get("name", ""), node.attrib.get("value", ""))
         yield file, node
         if node.tag == "include":
-            name = _filled(node.attrib.get("filename", ""), values | dict(parameters))
-            yield from _nodes(file.parent / name, values, parameters)
+            name = filled(node.attrib.get("filename", ""), values | dict(parameters))
+            yield from nodes(file.parent / name, values, parameters)
 
 
-def _filled(text: str, values: Mapping[str, str]) -> str:
+def filled(text: str, values: Mapping[str, str]) -> str:
+    """A text with the values of its ``$name``; those without a value stay."""
     return _NAME.sub(lambda match: values.get(match[1], match[0]), text)
 
 
 def _check_include(scene: Path, file: Path, pattern: str, values: Mapping[str, str]) -> None:
     """The file that a value chooses must be there: ``lights_$lights.xml`` says which values there are."""
     names = _NAME.findall(pattern)
-    if len(names) != 1 or (file.parent / _filled(pattern, values)).is_file():
+    if len(names) != 1 or (file.parent / filled(pattern, values)).is_file():
         return
     before, after = pattern.split(f"${names[0]}")
     found = sorted(file.parent.glob(f"{before}*{after}"))

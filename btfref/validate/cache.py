@@ -1,8 +1,8 @@
 """Results under names that say what they were made from: what has not changed is not computed again.
 
-A key is the SHA-256 of everything that a result depends on: settings, the keys of its parents, versions, and the text
-of the code behind it. A method's three files count for its own results only, so that work on one method leaves the
-others' results valid; code that methods share counts for all.
+A key is the SHA-256 of everything that a result depends on: settings, the keys of its parents, and the code, data and
+versions behind it (:mod:`btfref.provenance.code`). Beside each entry lies its seal, a hash of its bytes: an entry that
+is empty, cut or edited does not fit it, and is made again. An entry holds measurements and pictures, never a verdict.
 """
 
 from __future__ import annotations
@@ -10,14 +10,19 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from btfref.outputs import new_file
+from btfref.provenance import code
 
 if TYPE_CHECKING:
     from btfref.types import Facts, PathLike
+
+#: Ending of the files that hold seals.
+SEAL = ".sha256"
 
 
 def folder() -> Path:
@@ -40,10 +45,17 @@ class Cache:
     ----------
     root : path-like, optional
         Default: `folder`.
+
+    Attributes
+    ----------
+    computed : int
+        Results that this object made, since they were not there as they should be.
     """
 
     def __init__(self, root: PathLike | None = None) -> None:
         self.root = Path(root) if root is not None else folder()
+        self.computed = 0
+        self._whole: set[Path] = set()
 
     def path(self, key: str, suffix: str) -> Path:
         """Name of a result; its folder is there."""
@@ -51,17 +63,74 @@ class Cache:
         return (self.root / f"{key}{suffix}").resolve()
 
     def has(self, key: str, suffix: str) -> bool:
-        """Whether a result is there, complete."""
-        return (self.root / f"{key}{suffix}").exists()
+        """Whether a result is there, byte for byte as it was made."""
+        path = (self.root / f"{key}{suffix}").resolve()
+        if path not in self._whole and _sealed(path):
+            self._whole.add(path)
+        return path in self._whole
+
+    def get(self, key: str, suffix: str, save: Callable[[Path], object]) -> Path:
+        """A result, made by ``save(path)`` unless it is there.
+
+        Returns
+        -------
+        pathlib.Path
+            A file, or a folder where `save` makes one.
+        """
+        return self.path(key, suffix) if self.has(key, suffix) else self.write(key, suffix, save)
 
     def write(self, key: str, suffix: str, save: Callable[[Path], object]) -> Path:
         """Make a result by ``save(path)``; it appears under its name when it is complete.
+
+        It gets no seal, and counts for this object alone, when code has changed since it was read for the key.
 
         Returns
         -------
         pathlib.Path
         """
         path = self.path(key, suffix)
+        self.computed += 1
+        seal = path.with_name(path.name + SEAL)
+        _remove(seal)
         with new_file(path) as draft:
             save(draft)
+            value = None if code.changed() else digest(draft, path.name)
+            if path.is_dir() or draft.is_dir():  # only files take each other's place
+                _remove(path)
+        if value is not None:
+            with new_file(seal) as draft:
+                draft.write_text(value, "utf-8")
+        self._whole.add(path)
         return path
+
+
+def digest(path: Path, name: str) -> str:
+    """SHA-256 of a name and of a file's bytes, or of the names and bytes of all files in a folder.
+
+    Returns
+    -------
+    str
+    """
+    found = hashlib.sha256(f"{name}\0".encode())
+    if not path.is_dir():
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, lambda: found).hexdigest()
+    for inner in sorted(p for p in path.rglob("*") if p.is_file()):
+        found.update(f"{inner.relative_to(path).as_posix()}\0{digest(inner, '')}\0".encode())
+    return found.hexdigest()
+
+
+def _sealed(path: Path) -> bool:
+    """Whether an entry fits its seal."""
+    try:
+        value = path.with_name(path.name + SEAL).read_text("ascii")
+        return value == digest(path, path.name)
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

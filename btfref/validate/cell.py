@@ -16,15 +16,15 @@ from btfref.comparison.parts import part
 from btfref.comparison.waterfall import Picture, waterfall
 from btfref.conventions import PixelClass
 from btfref.errors import BtfrefError
-from btfref.gates.verdicts import GateResult, missing_reference
+from btfref.gates.verdicts import GateResult, judged, missing_reference
 from btfref.images.display import Display, fit_display
 from btfref.numerics.colour import decode_srgb
-from btfref.provenance import code_of
 from btfref.scene.shipped import scene_file
 from btfref.validate.cache import key_of
-from btfref.validate.material import fit_key
 from btfref.validate.matrix import ENVIRONMENTS
 from btfref.validate.pictures import fitted, make_views, shared_settings, views_key
+from btfref.validate.stages.drawn import code_of
+from btfref.validate.stages.fits import fit_key
 
 if TYPE_CHECKING:
     from btfref.comparison import Comparison
@@ -81,12 +81,15 @@ class CellResult:
     classes : (H, W) uint8 array or None
     variance : (H, W, 3) float32 array or None
         Of the reference, where it has noise.
+    measured : tuple of GateResult
+        The gates of a cell that was computed just now, with what they were judged from.
     """
 
     facts: Facts
     images: dict[str, np.ndarray]
     classes: np.ndarray | None = None
     variance: np.ndarray | None = None
+    measured: tuple[GateResult, ...] = ()
 
     @property
     def outcome(self) -> str:
@@ -130,7 +133,7 @@ def cell_key(spec: Spec, settings: Settings) -> str:
         {
             "cell": fit_key(spec.mesostructure, spec.method, settings),
             "views": views_key(spec.mesostructure, spec.scene, spec.lights, settings),
-            "code": code_of("picture", spec.method),
+            "code": code_of(__name__, spec.method),
         }
     )
 
@@ -143,14 +146,12 @@ def make_cell(cache: Cache, spec: Spec, settings: Settings) -> CellResult:
     CellResult
     """
     key = cell_key(spec, settings)
-    if not cache.has(key, ".cell.npz"):
-        try:
-            made = _cell(cache, spec, settings)
-        except BtfrefError as error:
-            # Not kept: what is missing may be there the next time.
-            return failed_cell(spec, str(error))
-        cache.write(key, ".cell.npz", lambda path: _save(path, made))
-    return read_cell(cache.path(key, ".cell.npz"))
+    try:
+        path = cache.get(key, ".cell.npz", lambda path: _save(path, _cell(cache, spec, settings)))
+    except BtfrefError as error:
+        # Not kept: what is missing may be there the next time.
+        return failed_cell(spec, str(error))
+    return read_cell(path)
 
 
 def failed_cell(spec: Spec, why: str) -> CellResult:
@@ -162,19 +163,31 @@ def failed_cell(spec: Spec, why: str) -> CellResult:
 
 
 def read_cell(path: Path) -> CellResult:
-    """A cell from its file."""
+    """A cell from its file, judged by the limits as they are now."""
     with np.load(path) as stored:
         images = {name[6:]: stored[name] for name in stored.files if name.startswith("image_")}
         variance = stored["variance"] if "variance" in stored.files else None
-        return CellResult(json.loads(str(stored["facts"])), images, stored["classes"], variance)
+        facts = json.loads(str(stored["facts"]))
+        gates = [judged(measurement) for measurement in facts.pop("measured")]
+        facts["gates"] = [json_safe(gate.to_dict()) for gate in gates]
+        if facts["waterfall"]:
+            own = [gate for gate in gates if gate.gate == "waterfall.closure"]
+            facts["waterfall"]["gates"] = [json_safe(gate.to_dict()) for gate in own]
+            facts["waterfall"]["explained"] = all(gate.passed for gate in own)
+        return CellResult(facts, images, stored["classes"], variance)
 
 
 def _save(path: Path, result: CellResult) -> None:
+    """Write a cell's pictures and measurements, without verdicts."""
+    facts = {**result.facts, "measured": [gate.measurement() for gate in result.measured]}
+    del facts["gates"]
+    if facts["waterfall"]:
+        facts["waterfall"] = {k: v for k, v in facts["waterfall"].items() if k not in ("gates", "explained")}
     parts: Facts = {f"image_{name}": image for name, image in result.images.items()}
     parts["classes"] = result.classes
     if result.variance is not None:
         parts["variance"] = result.variance
-    np.savez_compressed(path, facts=json.dumps(result.facts), **parts)
+    np.savez_compressed(path, facts=json.dumps(facts), **parts)
 
 
 def _cell(cache: Cache, spec: Spec, settings: Settings) -> CellResult:
@@ -202,7 +215,6 @@ def _cell(cache: Cache, spec: Spec, settings: Settings) -> CellResult:
     facts = {
         "name": spec.name,
         **vars(spec),
-        "gates": [gate.to_dict() for gate in (*comparison.gates, *found.gates)],
         "image_gates": list(gates),
         "metrics": {name: comparison.metrics.get(name, {}) for name in (PixelClass.INTERIOR.label, "all")},
         "waterfall": {
@@ -220,7 +232,9 @@ def _cell(cache: Cache, spec: Spec, settings: Settings) -> CellResult:
         **facts,
     }
     images = {"truth": views.truth.mean(0), "reference": reference.image, "realtime": image.image}
-    return CellResult(json_safe(facts), images, views.classes, reference.variance)
+    measured = (*comparison.gates, *found.gates)
+    facts["gates"] = [gate.to_dict() for gate in measured]
+    return CellResult(json_safe(facts), images, views.classes, reference.variance, measured)
 
 
 def _under_deltas(path: Path, spec: Spec, views: Views, settings: Settings, shared: Facts) -> _Chain:

@@ -1,14 +1,12 @@
-"""Materials of the matrix: sampled BTFs with an independent twin, and the fits of every method."""
+"""Materials of the matrix: sampled BTFs, each with an independent twin."""
 
 from __future__ import annotations
 
-import os
-import shutil
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from btfref.provenance import code_of
+from btfref.provenance.code import code_of
 from btfref.validate.cache import key_of
 
 if TYPE_CHECKING:
@@ -24,9 +22,13 @@ TWIN = 1000
 
 def material_key(mesostructure: str, settings: Settings) -> str:
     """Key of a sampled BTF and its twin."""
+    from btfref.mesostructure import place
+
     named = ("texels", "directions", "estimator", "spp", "seed")
     facts = {name: getattr(settings, name) for name in named}
-    return key_of({"material": mesostructure, **facts, "code": code_of("material")})
+    return key_of(
+        {"material": mesostructure, **facts, "code": code_of(__name__, places=(place(mesostructure),))}
+    )
 
 
 def make_material(
@@ -44,12 +46,6 @@ def make_material(
 
     key, paths = material_key(mesostructure, settings), []
     for twin in (0, 1):
-        path = cache.path(key, f".{twin}.btf.zarr")
-        paths.append(path)
-        if path.exists():
-            continue
-        # A run that was killed leaves its parts under this name, and nothing under the other.
-        partial = cache.path(key, f".{twin}.{os.getpid()}.btf.zarr")
         made = SynthesisSettings(
             texels=settings.texels,
             views=settings.directions,
@@ -58,11 +54,11 @@ def make_material(
             estimator=settings.estimator,
             seed=settings.seed + TWIN * twin,
         )
-        synthesize(mesostructure, made, out=partial, overwrite=True, progress=progress)
-        if path.exists():
-            shutil.rmtree(partial)
-        else:
-            os.replace(partial, path)
+
+        def save(path: Path, made: SynthesisSettings = made) -> None:
+            synthesize(mesostructure, made, out=path, progress=progress)
+
+        paths.append(cache.get(key, f".{twin}.btf.zarr", save))
     return paths
 
 
@@ -72,27 +68,3 @@ def load_material(path: Path) -> SampledBTF:
     from btfref.sampling import SampledBTF
 
     return SampledBTF.load(path, variance=False)
-
-
-def fit_key(mesostructure: str, method: str, settings: Settings) -> str:
-    """Key of a fit."""
-    facts = {"fit": method, "material": material_key(mesostructure, settings), "seed": settings.seed}
-    return key_of({**facts, "code": code_of("fit", method)})
-
-
-def make_fit(cache: Cache, mesostructure: str, method: str, settings: Settings) -> Path:
-    """Fit a method with its defaults to a material, unless that is done.
-
-    Returns
-    -------
-    pathlib.Path
-    """
-    from btfref.registry import method as row
-    from btfref.representations import save
-
-    key, suffix = fit_key(mesostructure, method, settings), f".{method}.exr"
-    if cache.has(key, suffix):
-        return cache.path(key, suffix)
-    btf = load_material(make_material(cache, mesostructure, settings)[0])
-    made = row(method).fit(btf, seed=settings.seed)
-    return cache.write(key, suffix, lambda path: save(made, path))

@@ -88,8 +88,8 @@ class Settings:
         Pixels at which the approximation under an environment is evaluated in float64.
     held_out_texels : int
         Texels along each side for the fits that leave directions out.
-    chi2_samples : int
-        Samples of each χ² test.
+    chi2_samples, chi2_intervals : int
+        Samples of each χ² test, and intervals a side in which the density is integrated over a cell of its table.
     seed : int
     """
 
@@ -106,6 +106,7 @@ class Settings:
     port_pixels: int = 64
     held_out_texels: int = 32
     chi2_samples: int = 1_000_000
+    chi2_intervals: int | None = None
     seed: int = 0
 
     def edge(self, lights: str) -> int:

@@ -12,9 +12,10 @@ import numpy as np
 from btfref.comparison import compare
 from btfref.errors import InputError
 from btfref.images import load_image
-from btfref.provenance import code_of
+from btfref.provenance.code import code_of
+from btfref.scene.files import digest_of, scene_facts
 from btfref.scene.shipped import scene_file
-from btfref.validate.cache import Cache, key_of
+from btfref.validate.cache import Cache, digest, key_of
 
 if TYPE_CHECKING:
     from btfref.comparison import Comparison
@@ -87,30 +88,28 @@ def reference_of(
     InputError
         For a scene that cannot be read.
     """
+    from btfref.representations.file.container import read_info
     from btfref.scene.description import read_scene
 
     path, parameters = scene_file(scene), dict(parameters or {})
     description = read_scene(path, parameters, size=size)
     files = {m.material.filename for m in description.meshes if m.material}
     facts: Facts = {
-        "scene": path.read_text("utf-8"),
-        "parameters": {k: v for k, v in parameters.items() if not Path(v).exists()},
-        "files": sorted(
-            _digest(name) for name in files | {v for v in parameters.values() if Path(v).is_file()}
-        ),
+        "scene": scene_facts(path, parameters),
+        "representations": sorted(digest_of(file) for file in files),
         "size": size,
         "delta": description.environment is None,
         "settings": [grid, shadows] if description.environment is None else [spp],
-        "code": code_of("picture"),
+        "code": code_of(__name__, *(read_info(file)["method"] for file in files)),
     }
-    store, key = Cache(cache), key_of({"reference": facts})
-    there = store.has(key, ".reference.npz")
-    if not there:
-        made = _render(path, parameters, size, grid, shadows, spp, facts["delta"])
-        store.write(key, ".reference.npz", lambda target: np.savez_compressed(target, **made))
-    with np.load(store.path(key, ".reference.npz")) as stored:
+
+    def save(target: Path) -> None:
+        np.savez_compressed(target, **_render(path, parameters, size, grid, shadows, spp, facts["delta"]))
+
+    store = Cache(cache)
+    with np.load(store.get(key_of({"reference": facts}), ".reference.npz", save)) as stored:
         variance = stored["variance"] if "variance" in stored.files else None
-        return Reference(stored["image"], stored["classes"], variance, there)
+        return Reference(stored["image"], stored["classes"], variance, not store.computed)
 
 
 def _render(
@@ -131,13 +130,6 @@ def _render(
         return made | {"image": render(path, grid=grid, shadows=shadows, **shared).image}
     result = render(path, spp=spp, with_variance=True, **shared)
     return made | {"image": result.image, "variance": result.variance}
-
-
-def _digest(name: PathLike) -> str:
-    import hashlib
-
-    with open(name, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def judge_image(
@@ -218,10 +210,15 @@ def representation_for(
     if btf is None:
         expected = "a .btf.zarr, or a file of the method"
         raise InputError("a method needs a BTF to be fitted to", field="--btf", expected=expected)
-    store = Cache(cache)
-    key = key_of({"fit": found.key, "btf": open_store(btf).info(), "code": code_of("fit", found.key)})
-    suffix = f".{found.key}.exr"
-    if not store.has(key, suffix):
-        made = found.fit(SampledBTF.load(btf, variance=False))
-        store.write(key, suffix, lambda path: save(made, path))
-    return store.path(key, suffix)
+
+    open_store(btf)  # says what is wrong with it
+
+    def save_fit(path: Path) -> None:
+        save(found.fit(SampledBTF.load(btf, variance=False)), path)
+
+    facts = {
+        "fit": found.key,
+        "btf": digest(Path(btf), ""),
+        "code": code_of("btfref.validate.stages.fits", found.key),
+    }
+    return Cache(cache).get(key_of(facts), f".{found.key}.exr", save_fit)

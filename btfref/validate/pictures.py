@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from btfref.provenance import code_of
+from btfref.scene.files import scene_facts
 from btfref.scene.shipped import scene_file
 from btfref.validate.cache import key_of
-from btfref.validate.material import fit_key, load_material, make_fit, make_material, material_key
+from btfref.validate.material import load_material, make_material, material_key
 from btfref.validate.matrix import ENVIRONMENTS, LIGHTS
+from btfref.validate.stages.drawn import code_of
+from btfref.validate.stages.fits import fit_key, make_fit
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -57,12 +59,11 @@ def views_key(mesostructure: str, scene: str | Path, lights: str, settings: Sett
     return key_of(
         {
             "views": material_key(mesostructure, settings),
-            "scene": scene_file(scene).read_text("utf-8"),
-            "lights": LIGHTS[lights],
+            "scene": scene_facts(scene, {"btf": "", **LIGHTS[lights]}),
             "size": [settings.edge(lights), settings.cells(lights)],
             **{name: getattr(settings, name) for name in named},
             "carrier": [CARRIER, CARRIER_PARAMETERS],
-            "code": code_of("picture", CARRIER),
+            "code": code_of(__name__, CARRIER, "raw"),
         }
     )
 
@@ -74,11 +75,12 @@ def make_views(cache: Cache, mesostructure: str, scene: str | Path, lights: str,
     -------
     Views
     """
+
+    def save(path: Path) -> None:
+        np.savez(path, **vars(_views(cache, mesostructure, scene, lights, settings)))
+
     key = views_key(mesostructure, scene, lights, settings)
-    if not cache.has(key, ".views.npz"):
-        made = _views(cache, mesostructure, scene, lights, settings)
-        cache.write(key, ".views.npz", lambda path: np.savez(path, **vars(made)))
-    with np.load(cache.path(key, ".views.npz")) as stored:
+    with np.load(cache.get(key, ".views.npz", save)) as stored:
         return Views(**{name: stored[name] for name in stored.files})
 
 
@@ -132,12 +134,12 @@ def make_carrier(cache: Cache, mesostructure: str, settings: Settings) -> Path:
     from btfref.registry import method
     from btfref.representations import save
 
-    key = fit_key(mesostructure, CARRIER, settings)
-    if cache.has(key, ".carrier.exr"):
-        return cache.path(key, ".carrier.exr")
-    btf = load_material(make_material(cache, mesostructure, settings)[0])
-    made = method(CARRIER).fit(btf, **CARRIER_PARAMETERS)
-    return cache.write(key, ".carrier.exr", lambda path: save(made, path))
+    def save_carrier(path: Path) -> None:
+        btf = load_material(make_material(cache, mesostructure, settings)[0])
+        save(method(CARRIER).fit(btf, **CARRIER_PARAMETERS), path)
+
+    key = key_of({"carrier": CARRIER_PARAMETERS, "fit": fit_key(mesostructure, CARRIER, settings)})
+    return cache.get(key, ".carrier.exr", save_carrier)
 
 
 def fitted(cache: Cache, spec: Spec, settings: Settings) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -18,13 +17,14 @@ from typing import TYPE_CHECKING, Any
 from btfref.comparison.comparison import json_safe
 from btfref.errors import BtfrefError, InputError
 from btfref.gates.verdicts import missing_reference
-from btfref.provenance import code_of
-from btfref.validate.cache import Cache, key_of
+from btfref.validate.cache import Cache
 from btfref.validate.cell import CellResult, failed_cell, gate_from, make_cell
-from btfref.validate.held_out import held_out_error
-from btfref.validate.material import fit_key, load_material, make_fit, make_material
+from btfref.validate.material import make_material
 from btfref.validate.matrix import FULL, Settings
 from btfref.validate.pictures import make_carrier, make_views
+from btfref.validate.stages.checks import make_checks
+from btfref.validate.stages.drawn import code_of, found, recall
+from btfref.validate.stages.fits import make_fit
 
 if TYPE_CHECKING:
     from btfref.gates.verdicts import GateResult
@@ -148,19 +148,23 @@ def validate(
     total = sum(len(stage) for stage in stages)
     workers = min(workers or default_workers(), max(len(stage) for stage in stages))
     report = progress or (lambda *_: None)
-    found, computed, done = [], 0, 0
+    # Before any process loads code: what changes after that is seen to have changed.
+    code = code_of("btfref.validate.cell", *{spec.method for spec in specs})
+    for one in sorted({spec.method for spec in specs}):
+        code_of("btfref.validate.stages.checks", one)
+    results, computed, done = [], 0, 0
     report(0, total, "validating")
     with _pool(workers) as pool:
         for stage in stages:
             for result, fresh in _each(pool, stage):
-                found.append(result)
+                results.append(result)
                 computed += fresh
                 done += 1
                 report(done, total, "validating")
-    of_methods = [result for result in found if isinstance(result, dict)]
+    of_methods = [result for result in results if isinstance(result, dict)]
     cells = sorted((c for r in of_methods for c in r.pop("cells")), key=lambda c: c.facts["name"])
     of_methods.sort(key=lambda m: (m["mesostructure"], m["method"]))
-    facts = {"versions": versions(), "workers": workers, "code": code_of("picture")}
+    facts = {"versions": versions(), "workers": workers, "code": code}
     return Validation(cells, of_methods, settings, time.perf_counter() - start, computed, total, facts)
 
 
@@ -183,7 +187,10 @@ def _pool(workers: int) -> Iterator[_Here | ProcessPoolExecutor]:
         return
     others = set(active_children())
     # Spawned: neither Dr.Jit nor a GL driver survives a fork.
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_start_worker) as pool:
+    made = ProcessPoolExecutor(
+        workers, mp_context=get_context("spawn"), initializer=_start_worker, initargs=(found(),)
+    )
+    with made as pool:
         try:
             yield pool
         except BaseException:
@@ -194,8 +201,9 @@ def _pool(workers: int) -> Iterator[_Here | ProcessPoolExecutor]:
             raise
 
 
-def _start_worker() -> None:
-    """About one core a process: their threads would only wait for each other."""
+def _start_worker(known: Facts) -> None:
+    """About one core a process: threads would only wait for each other. What is known need not be asked again."""
+    recall(known)
     os.environ["LP_NUM_THREADS"] = "1"
     from threadpoolctl import threadpool_limits
 
@@ -231,73 +239,36 @@ def _each(pool: _Here | ProcessPoolExecutor, jobs: Sequence[_Job]) -> Iterator[t
 
 def _material_job(root: PathLike, mesostructure: str, settings: Settings) -> tuple[None, bool]:
     cache = Cache(root)
-    before = len(os.listdir(root)) if os.path.isdir(root) else 0
     make_material(cache, mesostructure, settings)
     make_carrier(cache, mesostructure, settings)
-    return None, len(os.listdir(root)) != before
+    return None, cache.computed > 0
 
 
 def _views_job(
     root: PathLike, mesostructure: str, scene: str | Path, lights: str, settings: Settings
 ) -> tuple[None, bool]:
-    before = len(os.listdir(root))
+    cache = Cache(root)
     try:
-        make_views(Cache(root), mesostructure, scene, lights, settings)
+        make_views(cache, mesostructure, scene, lights, settings)
     except BtfrefError:
         # Every cell that needs them fails, and says why.
         return None, True
-    return None, len(os.listdir(root)) != before
+    return None, cache.computed > 0
 
 
 def _method_job(root: PathLike, specs: Sequence[Spec], settings: Settings) -> tuple[Facts, bool]:
     """All cells of one method and mesostructure, and the method's own checks."""
     cache, first = Cache(root), specs[0]
     facts = {"mesostructure": first.mesostructure, "method": first.method}
-    before = set(os.listdir(root))
     try:
-        file = make_fit(cache, first.mesostructure, first.method, settings)
-        checks = _checks(cache, first, file, settings)
+        make_fit(cache, first.mesostructure, first.method, settings)
+        checks = make_checks(cache, first.mesostructure, first.method, settings)
         cells = [make_cell(cache, spec, settings) for spec in specs]
     except BtfrefError as error:
         gates = [g.to_dict() for g in missing_reference("probe.agreement", str(error))]
         checks = {"gates": gates, "held_out": None, "notes": str(error)}
         cells = [failed_cell(spec, str(error)) for spec in specs]
-    return {**facts, **json_safe(checks), "cells": cells}, set(os.listdir(root)) != before
-
-
-def _checks(cache: Cache, spec: Spec, file: PathLike, settings: Settings) -> Facts:
-    """Agreement of the evaluators, sampling, and held-out directions of a method; cached."""
-    from btfref.registry import method
-    from btfref.representations.file.container import read_info
-    from btfref.validate.method_gates import probe_gates, sampling_gates
-
-    key = key_of(
-        {
-            "checks": fit_key(spec.mesostructure, spec.method, settings),
-            "code": code_of("picture", spec.method),
-            "samples": settings.chi2_samples,
-            "held_out_texels": settings.held_out_texels,
-        }
-    )
-    if cache.has(key, ".checks.json"):
-        return json.loads(cache.path(key, ".checks.json").read_text("utf-8"))
-    start = time.perf_counter()
-    gates = [*probe_gates(file), *sampling_gates(file, samples=settings.chi2_samples)]
-    btf = load_material(make_material(cache, spec.mesostructure, settings)[0])
-    fit = method(spec.method).fit
-    error = held_out_error(fit, btf, texels=settings.held_out_texels)
-    info = read_info(file)
-    checks = json_safe(
-        {
-            "gates": [gate.to_dict() for gate in gates],
-            "held_out": error,
-            "bytes": info["payload_bytes"],
-            "fit": info["fit"],
-            "seconds": time.perf_counter() - start,
-        }
-    )
-    cache.write(key, ".checks.json", lambda path: path.write_text(json.dumps(checks), "utf-8"))
-    return checks
+    return {**facts, **json_safe(checks), "cells": cells}, cache.computed > 0
 
 
 __all__ = ["CellResult", "Validation", "default_workers", "method_name", "validate"]

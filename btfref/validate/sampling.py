@@ -31,6 +31,7 @@ def chi_square(
     *,
     samples: int,
     tests: int = 1,
+    intervals: int | None = None,
     pdf_view: ArrayLike | None = None,
     counts: Callable[[JitArray, JitArray, JitArray], JitArray] | None = None,
 ) -> tuple[bool, str]:
@@ -46,6 +47,9 @@ def chi_square(
     samples : int
     tests : int
         That are made together: the level is Šidák-corrected by their number.
+    intervals : int, optional
+        Along each side of a cell of the test's table, over which the density is integrated; by default as many as so
+        many samples can tell from more.
     pdf_view : array_like, shape (3,), optional
         View of the density where it is another, which must be found out.
     counts : callable, optional
@@ -77,7 +81,7 @@ def chi_square(
         pdf_func=pdf,
         sample_dim=3,
         sample_count=samples,
-        ires=math.ceil(INTERVALS * math.sqrt(min(samples / INTERVALS_SAMPLES, 1))),
+        ires=intervals or math.ceil(INTERVALS * math.sqrt(min(samples / INTERVALS_SAMPLES, 1))),
     )
     # A test that fails writes its tables where it stands.
     with tempfile.TemporaryDirectory() as scratch, chdir(scratch):

@@ -1,7 +1,8 @@
 """Can the gates fail? Known faults, each to be caught by the gate that is meant for it.
 
 A fault is put where such a fault would be: into a copy of a shader, into maps on their way to the GPU, into a picture
-on its way to the comparison. What has no fault must pass all the same gates first.
+on its way to the comparison, into the code of a copy of the packages. What has no fault must pass all the same gates
+first.
 """
 
 from __future__ import annotations
@@ -17,14 +18,16 @@ from btfref.errors import BtfrefError
 from btfref.gates.tolerances import gate_table, limits
 from btfref.gates.verdicts import with_class
 from btfref.platform import shader_directory
-from btfref.validate.fault_bench import Bench
-from btfref.validate.faults import FAULTS
+from btfref.validate.injected.bench import Bench
+from btfref.validate.injected.edits import EDITS, copied
+from btfref.validate.injected.faults import FAULTS
 
 if TYPE_CHECKING:
     from btfref.gates.verdicts import GateResult
     from btfref.representations.protocol import Representation
     from btfref.types import Facts, PathLike, Progress
-    from btfref.validate.faults import Fault
+    from btfref.validate.injected.edits import Edit
+    from btfref.validate.injected.faults import Fault
 
 
 @dataclass(frozen=True)
@@ -62,34 +65,68 @@ class Caught:
         return {**vars(self), "failed": list(self.failed), "clean": list(self.clean)}
 
 
-def self_test(*, progress: Progress | None = None) -> list[Caught]:
+def self_test(*, edits: Sequence[Edit] = EDITS, progress: Progress | None = None) -> list[Caught]:
     """Inject every fault.
 
     Parameters
     ----------
+    edits : sequence of btfref.validate.injected.edits.Edit
+        Faults that edit code, each a process of its own.
     progress : callable, optional
         Called as ``progress(done, total, label)``.
 
     Returns
     -------
     list of Caught
-        In the order of `FAULTS`.
+        In the order of `FAULTS`, then of the edits.
 
     Raises
     ------
     BtfrefError
-        When a shader no longer holds the text that a fault replaces.
+        When a shader or a module no longer holds the text that a fault replaces, or what is in the cache is computed
+        again although nothing has changed.
     MissingDependencyError
         Without LLVM or OpenGL.
     """
-    report, results = progress or (lambda *_: None), []
+    report, total = progress or (lambda *_: None), len(FAULTS) + len(edits)
+    results: list[Caught] = []
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder))
-        for done, fault in enumerate(FAULTS):
-            report(done, len(FAULTS), "injecting faults")
+        for fault in FAULTS:
+            report(len(results), total, "injecting faults")
             results.append(_inject(bench, fault))
-    report(len(FAULTS), len(FAULTS), "injecting faults")
+    for caught in edit_test(edits):
+        report(len(results), total, "editing code")
+        results.append(caught)
+    report(total, total, "injecting faults")
     return results
+
+
+def edit_test(edits: Sequence[Edit] = EDITS) -> Iterator[Caught]:
+    """Edit code in a copy of the packages, after a run without failures that filled its cache.
+
+    Yields
+    ------
+    Caught
+        What was taken from the cache all the same failed nothing, and so is not caught.
+
+    Raises
+    ------
+    BtfrefError
+        As `self_test`.
+    """
+    if not edits:
+        return
+    methods = sorted({edit.method for edit in edits})
+    with copied() as copy:
+        clean = copy.run(methods).failed
+        if again := copy.run(methods).computed:
+            raise BtfrefError(f"{again} jobs were computed again although nothing had changed")
+        for edit in edits:
+            with copy.edited(edit):
+                found = copy.run([edit.method])
+            caught = edit.meant in found.failed and found.computed > 0 and not clean
+            yield Caught(edit.name, edit.meant, caught, found.failed, clean)
 
 
 def _inject(bench: Bench, fault: Fault) -> Caught:

@@ -6,7 +6,7 @@ import pytest
 
 from btfref.cli import main
 from btfref.gates import tolerance
-from btfref.validate.faults import FAULTS
+from btfref.validate.injected.faults import FAULTS
 from btfref.validate.self_test import entries, self_test, used_gates
 
 pytestmark = pytest.mark.usefixtures("renderers")
@@ -22,7 +22,7 @@ def test_every_gate_has_a_fault():
 
 def test_every_fault_is_caught_by_its_gate():
     """And every single limit is failed by some fault."""
-    found = self_test()
+    found = self_test(edits=())  # those have a file of their own, test_stale_results.py
     assert len(found) == len(FAULTS)
     assert [(fault.name, fault.failed) for fault in found if not fault.caught] == []
     assert [(fault.name, fault.clean) for fault in found if fault.clean] == []

@@ -11,10 +11,13 @@ from btfref.types import PathLike
 if TYPE_CHECKING:
     import numpy as np
 
+    from btfref.types import Facts
+
 
 def write_images(
     image: np.ndarray,
     out: Path,
+    facts: Facts,
     *,
     png: bool = False,
     classes: np.ndarray | None = None,
@@ -27,12 +30,15 @@ def write_images(
     image : ndarray, shape (H, W, 3)
     out : pathlib.Path
         The EXR file; `png` adds a tone-mapped PNG of the same name.
+    facts : dict
+        What the picture shows, see :mod:`btfref.rendering.picture`: the EXR file holds it.
     classes : ndarray of uint8, shape (H, W), optional
         Pixel classes, written to `classes_out`.
     """
     from btfref.images import save_image
+    from btfref.rendering.picture import attributes
 
-    save_image(out, image)
+    save_image(out, image, attributes=attributes(facts))
     if png:
         save_image(out.with_suffix(".png"), image)
     if classes is not None and classes_out is not None:

@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from btfref.commands.shared.stdout import stdout
 from btfref.errors import BtfrefError
 
 if TYPE_CHECKING:
@@ -39,9 +40,9 @@ def emit(text: str = "", *, flush: bool = False, coloured: bool = False) -> None
     coloured : bool
         Whether the text has colours of ours; its parts then went through `printable`.
     """
-    sys.stdout.write(f"{text if coloured else printable(text)}\n")
+    stdout().write(f"{text if coloured else printable(text)}\n")
     if flush:
-        sys.stdout.flush()
+        stdout().flush()
 
 
 def emit_json(data: object) -> None:

@@ -80,7 +80,8 @@ def test_the_layout_shows_every_floor():
 def test_versions_agree():
     changelog = (ROOT / "CHANGELOG.md").read_text("utf-8")
     released = re.findall(r"^## \[(\d+\.\d+\.\d+)\] – (\d{4}-\d\d-\d\d)$", changelog, re.MULTILINE)
-    assert len(released) == len(re.findall(r"^## ", changelog, re.MULTILINE))
+    sections = re.findall(r"^## (.*)$", changelog, re.MULTILINE)
+    assert len(released) == len(sections) - (sections[0] == "[Unreleased]")
     assert released == sorted(released, key=lambda r: [int(n) for n in r[0].split(".")], reverse=True)
     assert released[0][0] == __version__
     citation = (ROOT / "CITATION.cff").read_text("utf-8")

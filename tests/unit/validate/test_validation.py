@@ -1,9 +1,11 @@
 """The matrix of validation: selection, keys, failures, the report in a browser."""
 
+import copy
 import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 
 import jsonschema
 import numpy as np
@@ -11,22 +13,21 @@ import pytest
 from browser import browse
 from schemas import assert_follows_schema
 
-from btfref import provenance as caching
 from btfref.comparison.waterfall import Picture, waterfall
 from btfref.conventions import PixelClass
 from btfref.errors import InputError
-from btfref.gates import tolerance
+from btfref.gates import tolerance, tolerances
 from btfref.images.display import Display
-from btfref.provenance import code_of, method_files
-from btfref.registry import Method, methods
+from btfref.registry import methods
 from btfref.report.pack import pack, unpack, unpack_text
 from btfref.report.validation import write_validation
 from btfref.validate.cache import Cache
 from btfref.validate.cell import GATES, CellResult, eight_bits, failed_cell, read_cell
 from btfref.validate.cell import _save as save_cell
-from btfref.validate.material import fit_key, material_key
+from btfref.validate.material import material_key
 from btfref.validate.matrix import FULL, LIGHTS, MESOSTRUCTURES, QUICK, SCENES, Spec, select
 from btfref.validate.run import Validation
+from btfref.validate.stages.fits import fit_key
 from btfref.validate.summary import HEADER, rows
 
 
@@ -52,51 +53,6 @@ def test_keys_follow_what_a_result_depends_on(tmp_path, monkeypatch):
     assert fit_key("checker", "svd", QUICK) == fit_key("checker", "svd", replace(QUICK, size=QUICK.size + 1))
     assert fit_key("checker", "svd", QUICK) != fit_key("checker", "lpca", QUICK)
 
-    before = {key: code_of("picture", key) for key in ("svd", "lpca")}
-    owned = {row.key: method_files(row) for row in methods().values()}
-    changed = tmp_path / owned["svd"][0].name
-    changed.write_bytes(owned["svd"][0].read_bytes() + b"\n# changed\n")
-    real = caching.method_files
-
-    def of_changed(row):
-        files = real(row)
-        return [changed, *files[1:]] if row.key == "svd" else files
-
-    code_of.cache_clear()
-    monkeypatch.setattr(caching, "method_files", of_changed)
-    monkeypatch.setattr(
-        caching,
-        "_files",
-        lambda place, files=caching._files: [p for p in files(place) if p != owned["svd"][0]],
-    )
-    after = {key: code_of("picture", key) for key in ("svd", "lpca")}
-    code_of.cache_clear()
-    assert after["svd"] != before["svd"]
-    assert after["lpca"] == before["lpca"]
-
-
-def test_limits_of_a_method_decide_its_pictures_and_no_fit(tmp_path, monkeypatch):
-    def keys():
-        code_of.cache_clear()
-        return {(stage, key): code_of(stage, key) for stage in ("fit", "picture") for key in ("gbrdf", "svd")}
-
-    before, shipped = keys(), Method.tolerances.fget
-    changed = tmp_path / "tolerances.toml"
-    changed.write_text(shipped(methods()["gbrdf"]).read_text("utf-8").replace("0.33", "0.34"), "utf-8")
-    monkeypatch.setattr(
-        Method, "tolerances", property(lambda row: changed if row.key == "gbrdf" else shipped(row))
-    )
-    monkeypatch.setattr(
-        caching,
-        "_files",
-        lambda place, files=caching._files: [
-            p for p in files(place) if p != shipped(methods()["gbrdf"]).resolve()
-        ],
-    )
-    after = keys()
-    code_of.cache_clear()
-    assert {place for place in before if before[place] != after[place]} == {("picture", "gbrdf")}
-
 
 def test_results_appear_whole_or_not_at_all(tmp_path):
     store = Cache(tmp_path / "results")
@@ -108,6 +64,72 @@ def test_results_appear_whole_or_not_at_all(tmp_path):
     assert list((tmp_path / "results").iterdir()) == []
     store.write("key", ".txt", lambda path: path.write_text("whole"))
     assert store.path("key", ".txt").read_text() == "whole"
+    assert store.computed == 2
+
+
+def _entry(path, kind):
+    if kind == "folder":
+        path.mkdir()
+        (path / "inner").mkdir()
+        path = path / "inner" / "chunk"
+    path.write_bytes(b"what was measured, 0123456789")
+
+
+TAMPERINGS = {
+    "empty": lambda path: path.write_bytes(b""),
+    "cut": lambda path: path.write_bytes(path.read_bytes()[:-1]),
+    "flipped": lambda path: path.write_bytes(bytes([path.read_bytes()[0] ^ 1]) + path.read_bytes()[1:]),
+    "edited": lambda path: path.write_bytes(path.read_bytes().replace(b"0123456789", b"1234561234")),
+    "longer": lambda path: path.write_bytes(path.read_bytes() + b"0"),
+    "gone": lambda path: path.unlink(),
+    "another's": lambda path: path.write_bytes(b"what was measured, 9999999999"),
+}
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+@pytest.mark.parametrize("tampering", TAMPERINGS)
+def test_what_was_tampered_with_is_made_again(tmp_path, tampering, kind):
+    def save(path):
+        _entry(path, kind)
+
+    entry = Cache(tmp_path).get("key", ".json", save)
+    assert Cache(tmp_path).has("key", ".json")
+    target = entry / "inner" / "chunk" if kind == "folder" else entry
+    TAMPERINGS[tampering](target)
+    again = Cache(tmp_path)
+    assert not again.has("key", ".json")
+    again.get("key", ".json", save)
+    assert again.computed == 1
+    assert target.read_bytes() == b"what was measured, 0123456789"
+    assert Cache(tmp_path).has("key", ".json")
+
+
+def test_a_file_takes_the_place_of_a_folder_and_the_other_way_round(tmp_path):
+    for kind, there in (("file", Path.mkdir), ("folder", Path.touch)):
+        path = Cache(tmp_path).path(kind, ".x")
+        there(path)
+        Cache(tmp_path).get(kind, ".x", lambda path, kind=kind: _entry(path, kind))
+        assert Cache(tmp_path).has(kind, ".x")
+        assert path.is_dir() == (kind == "folder")
+
+
+def test_a_seal_is_of_its_own_entry(tmp_path):
+    store = Cache(tmp_path)
+    for key, text in (("a", "1"), ("b", "2")):
+        store.get(key, ".txt", lambda path, text=text: path.write_text(text))
+    for name in ("b.txt", "b.txt.sha256"):
+        (tmp_path / name.replace("b", "a", 1)).write_bytes((tmp_path / name).read_bytes())
+    assert not Cache(tmp_path).has("a", ".txt")
+    (tmp_path / "b.txt.sha256").write_bytes(b"\xff\x00")
+    assert not Cache(tmp_path).has("b", ".txt")
+
+
+def test_what_code_made_that_changed_meanwhile_is_not_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr("btfref.provenance.code.changed", lambda: [tmp_path])
+    store = Cache(tmp_path)
+    store.get("key", ".txt", lambda path: path.write_text("1"))
+    assert store.has("key", ".txt")  # it serves who made it
+    assert not Cache(tmp_path).has("key", ".txt")
 
 
 def test_a_missing_reference_fails_every_gate():
@@ -170,8 +192,9 @@ def result(rng):
             "frame_ms": 2.0 + len(cells),
         }
         made = CellResult(facts, images, classes)
-        facts["gates"] = [g.to_dict() for g in (*made.comparison().gates, *fall.gates)]
-        cells.append(made)
+        measured = (*made.comparison().gates, *fall.gates)
+        facts["gates"] = [g.to_dict() for g in measured]
+        cells.append(replace(made, measured=measured))
     held = {"seen": {"rmse": 0.1, "mae": 0.1}, "held_out": {"rmse": 0.3, "mae": 0.2}}
     held |= {"views": [41, 40], "lights": [41, 40]}
     of_methods = [
@@ -193,7 +216,24 @@ def test_a_cell_comes_back_from_its_file(result, tmp_path):
     again = read_cell(tmp_path / "a.cell.npz")
     assert again.facts == json.loads(json.dumps(cell.facts))
     assert again.gates == cell.gates
+    with np.load(tmp_path / "a.cell.npz") as stored:
+        text = str(stored["facts"])
+    assert '"passed"' not in text
+    assert '"outcome"' not in text
+    assert '"explained"' not in text
     np.testing.assert_array_equal(again.images["truth"], cell.images["truth"])
+
+
+def test_verdicts_follow_the_limits_of_today(result, tmp_path, monkeypatch):
+    """Nothing is measured again: the stored number meets another limit."""
+    save_cell(tmp_path / "a.cell.npz", result.cells[0])
+    assert read_cell(tmp_path / "a.cell.npz").outcome == "pass"
+    strict = copy.deepcopy(tolerances._gates())
+    strict["image.noise_free"]["max"] = 0.0
+    monkeypatch.setattr(tolerances, "_gates", lambda: strict)
+    cell = read_cell(tmp_path / "a.cell.npz")
+    assert cell.outcome == "fail"
+    assert [gate.name for gate in cell.gates if not gate.passed] == ["image.noise_free.max"]
 
 
 def test_results_follow_the_schema(result):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from btfref.gates.verdicts import GateResult, Measured, judge
 from btfref.images.display import fit_display
 from btfref.scene.shipped import scene_file
 from btfref.stress.data import bumpy
-from btfref.stress.evaluators import evaluator
+from btfref.stress.evaluators import DEFINITION, PORTS, DrJit, evaluator
 from btfref.stress.judging import port_agreement
 from btfref.stress.lookups import USUAL, hard_lookups, hemisphere
 from btfref.types import Facts
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from btfref.representations.protocol import Representation
     from btfref.sampling import SampledBTF
     from btfref.types import JitArray
-    from btfref.validate.faults import Fault, Subject
+    from btfref.validate.injected.faults import Fault, Subject
 
 
 #: The picture of the faults of the host: a curved surface seen from both sides, and more than one light.
@@ -68,6 +68,30 @@ class Altered:
         if self._change == "pdf":
             bs.pdf *= 1.01
         return bs, weight * (1.01 if self._change == "weight" else 1.0)
+
+
+class _BrighterPort:
+    """A Dr.Jit port whose values are a hundredth too large."""
+
+    def __init__(self, port: JitArray) -> None:
+        self._port = port
+
+    def __getattr__(self, name: str) -> JitArray:
+        return getattr(self._port, name)
+
+    def evaluate(self, *arguments: JitArray, **settings: JitArray) -> JitArray:
+        return 1.01 * self._port.evaluate(*arguments, **settings)
+
+
+def _brighter(representation: Representation) -> Representation:
+    """A representation whose definition is a hundredth too bright, and nothing else of it."""
+
+    def evaluate(self: Representation, *arguments: JitArray, **settings: JitArray) -> np.ndarray:
+        return 1.01 * kind.evaluate(self, *arguments, **settings)
+
+    kind = type(representation)
+    brighter: Any = type(kind.__name__, (kind,), {"evaluate": evaluate})
+    return brighter.from_arrays(representation.arrays(), representation.meta)
 
 
 class Bench:
@@ -184,6 +208,22 @@ class Bench:
             *port_agreement(value, representation, lookups.points, lookups.lod).gates,
             *judge("probe.finite", {"nonfinite": int(np.count_nonzero(~np.isfinite(value)))}),
         ]
+
+    def evaluators(self, subject: Subject, change: str = "") -> Gates:
+        """Both ports against the definition; the fault is a hundredth more of one of them."""
+        representation, path = self.fit(subject)
+        lookups = hard_lookups(np.random.default_rng(16), representation, 4000, USUAL)
+        made = {name: evaluator(name, representation, path) for name in PORTS}
+        if change == DEFINITION:
+            representation = _brighter(representation)
+        brighter = made.get(change)
+        if isinstance(brighter, DrJit):
+            brighter.plugin.evaluator = _BrighterPort(brighter.plugin.evaluator)
+        found: list[GateResult] = []
+        for port in made.values():
+            value = port.evaluate(*lookups.points, lod=lookups.lod)
+            found += port_agreement(value, representation, lookups.points, lookups.lod).gates
+        return found
 
     def harmonics(self, subject: Subject) -> Gates:
         """The shader under an environment in spherical harmonics against float64."""

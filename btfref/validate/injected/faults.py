@@ -18,7 +18,7 @@ class Fault:
     meant : str
         The limit that must fail: gate and entry.
     look : str
-        Method of `btfref.validate.fault_bench.Bench` that looks for faults of this kind and returns gates.
+        Method of `btfref.validate.injected.bench.Bench` that looks for faults of this kind and returns gates.
     method : str
         Registry key of what is looked at.
     edit : tuple of str, optional
@@ -102,6 +102,8 @@ FAULTS = (
         ),
     ),
     Fault("sRGB read as linear", "image.eight_bit.code_p999", "eight_bits", change="linear"),
+    Fault("the definition a hundredth too bright", PROBE, "evaluators", change="numpy"),
+    Fault("a Dr.Jit port's evaluation a hundredth too bright", PROBE, "evaluators", change="drjit"),
     Fault("float16 overflow", "probe.finite.nonfinite", "overflow", "svd", change="overflow"),
     Fault(
         "negative values clamped",

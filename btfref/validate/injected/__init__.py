@@ -1,0 +1,1 @@
+"""Known faults: which there are, where they are looked for, and those that edit code."""

@@ -1,0 +1,69 @@
+"""A method's own checks on one mesostructure: evaluators, sampling, directions that were held out."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from btfref.comparison.comparison import json_safe
+from btfref.gates.verdicts import judged
+from btfref.validate.cache import key_of
+from btfref.validate.held_out import held_out_error
+from btfref.validate.material import load_material, make_material
+from btfref.validate.stages.drawn import code_of
+from btfref.validate.stages.fits import fit_key, make_fit
+
+if TYPE_CHECKING:
+    from btfref.types import Facts
+    from btfref.validate.cache import Cache
+    from btfref.validate.matrix import Settings
+
+
+def make_checks(cache: Cache, mesostructure: str, method: str, settings: Settings) -> Facts:
+    """Measure, or read, what is measured of a method, and judge it by the limits as they are now.
+
+    Returns
+    -------
+    dict
+        ``gates`` of its evaluators and its sampling, ``held_out``, ``bytes``, ``fit``, ``seconds``.
+    """
+    key = key_of(
+        {
+            "checks": fit_key(mesostructure, method, settings),
+            "code": code_of(__name__, method),
+            "samples": [settings.chi2_samples, settings.chi2_intervals],
+            "held_out_texels": settings.held_out_texels,
+        }
+    )
+
+    def save(path: Path) -> None:
+        path.write_text(json.dumps(_measured(cache, mesostructure, method, settings)), "utf-8")
+
+    found: Facts = json.loads(cache.get(key, ".checks.json", save).read_text("utf-8"))
+    gates = [judged(measurement) for measurement in found.pop("measured")]
+    return json_safe({"gates": [gate.to_dict() for gate in gates], **found})
+
+
+def _measured(cache: Cache, mesostructure: str, key: str, settings: Settings) -> Facts:
+    from btfref.registry import method
+    from btfref.representations.file.container import read_info
+    from btfref.validate.method_gates import probe_gates, sampling_gates
+
+    start = time.perf_counter()
+    file = make_fit(cache, mesostructure, key, settings)
+    gates = probe_gates(file)
+    gates += sampling_gates(file, samples=settings.chi2_samples, intervals=settings.chi2_intervals)
+    btf = load_material(make_material(cache, mesostructure, settings)[0])
+    error = held_out_error(method(key).fit, btf, texels=settings.held_out_texels)
+    info = read_info(file)
+    return json_safe(
+        {
+            "measured": [gate.measurement() for gate in gates],
+            "held_out": error,
+            "bytes": info["payload_bytes"],
+            "fit": info["fit"],
+            "seconds": time.perf_counter() - start,
+        }
+    )
