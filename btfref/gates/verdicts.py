@@ -23,6 +23,7 @@ _WORDS = {
     "rejected_fraction": ("share of significant differences", "rejected share"),
     "relative_rmse": ("RMSE / mean without noise", "RMSE / mean"),
     "bias_fraction": ("bias / mean", "bias / mean"),
+    "min_judged_share": ("share of covered pixels judged", "judged share"),
 }
 
 
@@ -53,6 +54,8 @@ class GateResult:
         Class judged, empty for gates that are not about pixels.
     detail : str
         What a failure, or an undecided test, needs as explanation.
+    judged : float or None
+        Share of the covered pixels that the gate looked at; None for gates that are not about those.
     """
 
     name: str
@@ -63,6 +66,7 @@ class GateResult:
     outcome: str = "pass"
     pixel_class: str = ""
     detail: str = ""
+    judged: float | None = None
 
     @property
     def gate(self) -> str:
@@ -73,6 +77,11 @@ class GateResult:
     def entry(self) -> str:
         """The entry within the gate, ``"p999"``."""
         return self.name.rpartition(".")[2]
+
+    @property
+    def pixels(self) -> str:
+        """The class judged and its share of the covered pixels, ``"interior+edge, 97.2 %"``; empty without a class."""
+        return self.pixel_class + ("" if self.judged is None else f", {100 * self.judged:.1f} %")
 
     @property
     def sign(self) -> str:
@@ -92,7 +101,7 @@ class GateResult:
     @property
     def line(self) -> str:
         """The result in one line, for a terminal or a test's message."""
-        where = f" [{self.pixel_class}]" if self.pixel_class else ""
+        where = f" [{self.pixels}]" if self.pixel_class else ""
         value = "no value" if self.value is None else f"{self.value:.4g}"
         detail = f" ({self.detail})" if self.detail else ""
         return f"{self.outcome}: {self.name}{where} {value}, wanted {self.sign} {self.limit:g}{detail}"
@@ -108,6 +117,7 @@ class GateResult:
             "class": self.pixel_class,
             "reason": self.reason,
             "detail": self.detail,
+            "judged": self.judged,
         }
 
 

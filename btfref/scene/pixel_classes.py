@@ -17,10 +17,26 @@ from btfref.types import JitArray, SceneLike
 #: which is far less; a fold in front of another surface leaves it by their distance.
 STEP = 0.25
 
-#: Distance in pixels, along each axis, within which a rasterizer may give a sample to the next triangle:
+#: Distance in pixels, along each axis, within which a rasterizer may decide otherwise whether a sample hits a surface:
 #: vertices are rounded to multiples of 1/256 pixel (Direct3D 11.3 functional specification, 3.4.1; GPUs and
 #: llvmpipe follow it).
 SNAP = 0.5 / 256
+
+#: Angle, in radians, within which two renderers may give a sample to one or the other of two triangles that meet. Which
+#: one the rasterizer draws does not matter, since shaders follow the ray (``lib/surface/triangle_table.glsl``), so that
+#: rounding is left: positions at a distance of some units are good to 5e-7 of it in float32, barycentric coordinates of
+#: small triangles to a few times that.
+ROUNDING = 2e-6
+
+#: Step in depth, in pixels, between rays `SNAP` apart that is an edge: a smooth surface leaves its tangent plane by far
+#: less, unless it is seen at grazing.
+NEAR_STEP = 8 * SNAP
+
+#: z of the view, in the shading frame, below which renderers may differ on which side is seen.
+HORIZON = 1e-5
+
+#: Change of the texture coordinates between rays `ROUNDING` apart that is a seam.
+SEAM = 1e-3
 
 #: Distance in uv, along each axis and both diagonals, within which two renderers may hit different points of a
 #: displaced surface: interpolated texture coordinates round by 1e-6 of their range, which repeats several times.
@@ -30,7 +46,7 @@ HIT = 1e-5
 #: mesostructure (its silhouettes, borders of its shadows) and no rounding.
 EDGE = 1e-3
 
-#: Turn of the tangent frame, in radians, below which the neighbouring triangle shows the same value.
+#: Turn of the shading frame, in radians, below which the neighbouring triangle shows the same value.
 TURN = 1e-4
 
 
@@ -44,14 +60,15 @@ def pixel_classes(
 ) -> np.ndarray:
     """Class of every pixel, from the primary hits of a regular sub-pixel grid.
 
-    A pixel is *silhouette* when samples of it or of its eight neighbours mix hit and miss or several shapes,
-    when the surface jumps in depth between two of them (a fold in front of the cloth itself), or when the
-    view passes the horizon of the shading normal, where B jumps to zero. There, two renderers may see
-    different surfaces at the same sample: rasterizers snap vertices to 1/256 pixel. Hence a pixel is
-    silhouette, too, when one of its samples lies that close to an edge between triangles whose tangent frames
-    differ: ∂p/∂u is constant on a triangle, so B jumps there. *Mesostructure* are the other pixels in which a
-    material with a geometry of its own (a g-BRDF) jumps within `HIT` of a sample, under one of the scene's delta
-    lights. All other pixels that are hit are *interior*.
+    A sample *may be seen otherwise* by another renderer where rays half a step of 1/256 pixel beside it, by which
+    rasterizers snap vertices, hit something else: nothing, another shape, a surface at another depth, or the other side
+    of the shading normal, at whose horizon B jumps to zero; and where rays within float32 rounding hit a triangle with
+    another frame or other texture coordinates, since ∂p/∂u is constant on a triangle and B jumps there. A pixel with
+    such a sample is *silhouette*. An *edge* pixel has none, but its samples or those of its eight neighbours meet an
+    edge: they mix hit and miss or several shapes, the surface jumps in depth between two of them (a fold in front of
+    the cloth itself), or turns away from the view. *Mesostructure* are other pixels in which a material with a
+    geometry of its own (a g-BRDF) jumps within `HIT` of a sample, under one of the scene's delta lights. All other
+    pixels that are hit are *interior*.
 
     Parameters
     ----------
@@ -85,11 +102,11 @@ def pixel_classes(
         edge[b] |= differs
     pixels = (shape.shape[0] // grid, grid, shape.shape[1] // grid, grid)
     any_edge = _spread(np.any(edge.reshape(pixels), axis=(1, 3)))
-    any_edge |= np.any(ambiguous.reshape(pixels), axis=(1, 3))
     any_hit = hit.reshape(pixels).any((1, 3))
-    inner = np.where(jumps, PixelClass.MESOSTRUCTURE, PixelClass.INTERIOR)
-    seen = np.where(any_hit, inner, PixelClass.BACKGROUND)
-    return np.where(any_edge, PixelClass.SILHOUETTE, seen).astype(np.uint8)
+    seen = np.where(any_hit, np.where(any_edge, PixelClass.EDGE, PixelClass.INTERIOR), PixelClass.BACKGROUND)
+    seen = np.where(jumps & any_hit, PixelClass.MESOSTRUCTURE, seen)
+    seen = np.where(np.any(ambiguous.reshape(pixels), axis=(1, 3)), PixelClass.SILHOUETTE, seen)
+    return seen.astype(np.uint8)
 
 
 def _displaced_edges(scene: JitArray, grid: int) -> np.ndarray | bool:
@@ -153,7 +170,7 @@ def _hits(scene: JitArray, grid: int) -> list[np.ndarray]:
     footprint : ndarray of float32
         Size of a pixel at the hit.
     ambiguous : ndarray of bool
-        Within `SNAP` of a triangle with another tangent frame.
+        Where another renderer may see something else.
     """
     import drjit as dr
     import mitsuba as mi
@@ -175,17 +192,21 @@ def _hits(scene: JitArray, grid: int) -> list[np.ndarray]:
         beside, _ = film_rays(sensor, (offset[0] + 1, offset[1]))
         si = scene.ray_intersect(ray)
         hit = si.is_valid()
-        ambiguous = dr.zeros(mi.Bool, dr.width(ray))
-        for x, y in ((-SNAP, -SNAP), (SNAP, -SNAP), (-SNAP, SNAP), (SNAP, SNAP)):
-            moved = scene.ray_intersect(film_rays(sensor, (offset[0] + x, offset[1] + y))[0], hit)
-            other = (moved.prim_index != si.prim_index) & moved.is_valid()
-            ambiguous |= other & (dr.norm(moved.sh_frame.s - si.sh_frame.s) > TURN)
+        footprint = dr.select(hit, si.t * dr.norm(ray.d - beside.d), 0)
+        ambiguous = hit & (dr.abs(si.wi.z) < HORIZON)
+        # Of a pixel, as the angle asks for; a finer triangle than that cannot be told from its neighbours.
+        rounding = dr.minimum(SNAP, ROUNDING / dr.norm(ray.d - beside.d))
+        for x, y in ((-1, -1), (1, -1), (-1, 1), (1, 1)):
+            snapped = scene.ray_intersect(film_rays(sensor, (offset[0] + x * SNAP, offset[1] + y * SNAP))[0])
+            ambiguous |= _seen_otherwise(si, snapped, footprint)
+            near = film_rays(sensor, (offset[0] + x * rounding, offset[1] + y * rounding))[0]
+            ambiguous |= _in_another_frame(si, scene.ray_intersect(near))
         values = {
             "shape": dr.select(hit, dr.reinterpret_array(mi.UInt32, si.shape), 0),
             "point": dr.select(hit, si.p, 0),
             "normal": dr.select(hit, si.n, 0),
             "front": si.wi.z > 0,
-            "footprint": dr.select(hit, si.t * dr.norm(ray.d - beside.d), 0),
+            "footprint": footprint,
             "ambiguous": ambiguous,
         }
         dr.eval(values)
@@ -195,3 +216,24 @@ def _hits(scene: JitArray, grid: int) -> list[np.ndarray]:
             array = array.T if array.ndim == 2 else array
             made[name][:, j, :, i] = array.reshape(height, width, *array.shape[1:])
     return [array.reshape(height * grid, width * grid, *array.shape[4:]) for array in made.values()]
+
+
+def _seen_otherwise(si: JitArray, other: JitArray, footprint: JitArray) -> JitArray:
+    """Whether a ray beside hits what the rasterizer may take for the sample's: another surface, or its other side."""
+    import drjit as dr
+
+    both = si.is_valid() & other.is_valid()
+    differs = both & ((si.shape != other.shape) | ((si.wi.z > 0) != (other.wi.z > 0)))
+    step = other.p - si.p
+    away = dr.maximum(dr.abs(dr.dot(si.n, step)), dr.abs(dr.dot(other.n, step)))
+    return (si.is_valid() != other.is_valid()) | differs | (both & (away > NEAR_STEP * footprint))
+
+
+def _in_another_frame(si: JitArray, other: JitArray) -> JitArray:
+    """Whether a ray beside hits a triangle whose shading frame or texture coordinates are not the continued ones."""
+    import drjit as dr
+
+    turn = dr.norm(other.sh_frame.s - si.sh_frame.s) + dr.norm(other.sh_frame.n - si.sh_frame.n)
+    jump = dr.max(dr.abs(other.uv - si.uv)) > SEAM
+    both = si.is_valid() & other.is_valid()
+    return both & (si.prim_index != other.prim_index) & ((turn > TURN) | jump)

@@ -263,6 +263,7 @@ def _checks(cache: Cache, spec: Spec, file: PathLike, settings: Settings) -> Fac
     from btfref.registry import method
     from btfref.representations.file.container import read_info
     from btfref.validate.method_gates import probe_gates, sampling_gates
+    from btfref.validate.witness.gates import testify
 
     key = key_of(
         {
@@ -275,7 +276,8 @@ def _checks(cache: Cache, spec: Spec, file: PathLike, settings: Settings) -> Fac
     if cache.has(key, ".checks.json"):
         return json.loads(cache.path(key, ".checks.json").read_text("utf-8"))
     start = time.perf_counter()
-    gates = [*probe_gates(file), *sampling_gates(file, samples=settings.chi2_samples)]
+    gates = [*probe_gates(file), *testify(file).gates()]
+    gates += sampling_gates(file, samples=settings.chi2_samples)
     btf = load_material(make_material(cache, spec.mesostructure, settings)[0])
     fit = method(spec.method).fit
     error = held_out_error(fit, btf, texels=settings.held_out_texels)
