@@ -57,6 +57,7 @@ def pixel_classes(
     size: tuple[int, int] | None = None,
     grid: int = 4,
     variant: str = "llvm_ad_rgb",
+    follows_rays: bool = True,
 ) -> np.ndarray:
     """Class of every pixel, from the primary hits of a regular sub-pixel grid.
 
@@ -80,6 +81,9 @@ def pixel_classes(
         n of the n × n samples.
     variant : str
         A JIT variant of Mitsuba.
+    follows_rays : bool
+        Whether the renderer to be judged decides by rays between triangles that meet, as btfref's does. False: by its
+        rasterizer, which snaps inner edges as it does silhouettes.
 
     Returns
     -------
@@ -87,7 +91,9 @@ def pixel_classes(
         Codes of `PixelClass`.
     """
     with loaded(scene, parameters, variant=variant, size=size) as made:
-        shape, point, normal, front, footprint, ambiguous = _hits(made, grid)
+        shape, point, normal, front, footprint, ambiguous = _hits(
+            made, grid, ROUNDING if follows_rays else np.inf
+        )
         jumps = _displaced_edges(made, grid)
     hit = shape > 0
     edge = np.zeros(shape.shape, bool)
@@ -156,8 +162,8 @@ def _spread(mask: np.ndarray) -> np.ndarray:
     return np.any([padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3)], axis=0)
 
 
-def _hits(scene: JitArray, grid: int) -> list[np.ndarray]:
-    """Primary hits on the fine grid.
+def _hits(scene: JitArray, grid: int, angle: float) -> list[np.ndarray]:
+    """Primary hits on the fine grid; between triangles that meet, ``angle`` decides, but no more than `SNAP`.
 
     Returns
     -------
@@ -195,7 +201,7 @@ def _hits(scene: JitArray, grid: int) -> list[np.ndarray]:
         footprint = dr.select(hit, si.t * dr.norm(ray.d - beside.d), 0)
         ambiguous = hit & (dr.abs(si.wi.z) < HORIZON)
         # Of a pixel, as the angle asks for; a finer triangle than that cannot be told from its neighbours.
-        rounding = dr.minimum(SNAP, ROUNDING / dr.norm(ray.d - beside.d))
+        rounding = dr.minimum(SNAP, dr.opaque(mi.Float, angle) / dr.norm(ray.d - beside.d))
         for x, y in ((-1, -1), (1, -1), (-1, 1), (1, 1)):
             snapped = scene.ray_intersect(film_rays(sensor, (offset[0] + x * SNAP, offset[1] + y * SNAP))[0])
             ambiguous |= _seen_otherwise(si, snapped, footprint)
