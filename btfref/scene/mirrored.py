@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from btfref.scene.hits import Surface
+from btfref.scene.camera import film_rays
 from btfref.types import JitArray
 
 if TYPE_CHECKING:
@@ -28,14 +28,25 @@ def seen_mirrored(scene: JitArray) -> list[str]:
     scene : mitsuba.Scene
         Of a JIT variant.
     """
+    import drjit as dr
+    import mitsuba as mi
+
+    from mitsuba_plugins.lib.frame import hand_of
     from mitsuba_plugins.protocol import shown_by
 
-    surface, found = Surface(scene, (0.5, 0.5)), []
-    for shape in scene.shapes():
-        hands = {one.turn.hand for one in shown_by(shape.bsdf())}
-        if hands and np.isin(-surface.hand[surface.sees(shape)], list(hands)).any():
-            found.append(shape.id())
-    return found
+    turns = [(shape, {one.turn.hand for one in shown_by(shape.bsdf())}) for shape in scene.shapes()]
+    if not any(hands for _, hands in turns):
+        return []
+    si = scene.ray_intersect(film_rays(scene.sensors()[0], (0.5, 0.5))[0])
+    shape_seen = dr.select(si.is_valid(), dr.reinterpret_array(mi.UInt32, si.shape), 0)
+    hand = hand_of(si)
+    dr.eval(shape_seen, hand)
+    seen = set(zip(np.array(shape_seen).tolist(), np.array(hand).tolist(), strict=True))
+    return [
+        shape.id()
+        for shape, hands in turns
+        if any((int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]), -h) in seen for h in hands)
+    ]
 
 
 def mirrored_meshes(meshes: Sequence[MeshDescription]) -> list[str]:

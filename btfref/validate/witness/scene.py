@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from btfref.types import Facts, JitArray, PathLike
+    from btfref.types import Facts, PathLike
 
 #: Edge of the picture in pixels, and sub-pixels per axis.
 SIZE, GRID = 40, 2
@@ -157,7 +157,7 @@ class WitnessScene:
         }
 
 
-def _rgb(value: tuple[float, float, float]) -> JitArray:
+def _rgb(value: tuple[float, float, float]) -> Facts:
     return {"type": "rgb", "value": list(value)}
 
 
