@@ -193,25 +193,29 @@ def _hits(scene: JitArray, grid: int, angle: float) -> list[np.ndarray]:
         "ambiguous": np.zeros(fine, bool),
     }
     offsets = grid_offsets(grid)
+    (ray, _), (beside, _) = (film_rays(sensor, (x, 0.5)) for x in (0.5, 1.5))
+    pixel = dr.norm(ray.d - beside.d)
+    dr.eval(pixel)
+    # Of a pixel, as the angle asks for; a finer triangle than that cannot be told from its neighbours.
+    rounding = min(SNAP, angle / float(np.array(pixel).min()))
     for number, offset in enumerate(offsets):
-        ray, _ = film_rays(sensor, offset)
-        beside, _ = film_rays(sensor, (offset[0] + 1, offset[1]))
-        si = scene.ray_intersect(ray)
-        hit = si.is_valid()
-        footprint = dr.select(hit, si.t * dr.norm(ray.d - beside.d), 0)
-        ambiguous = hit & (dr.abs(si.wi.z) < HORIZON)
-        # Of a pixel, as the angle asks for; a finer triangle than that cannot be told from its neighbours.
-        rounding = dr.minimum(SNAP, dr.opaque(mi.Float, angle) / dr.norm(ray.d - beside.d))
+        seen = _seen(scene, offset)
+        footprint = dr.select(seen["shape"] > 0, seen["distance"] * pixel, 0)
+        ambiguous = (seen["shape"] > 0) & (dr.abs(seen["height"]) < HORIZON)
+        dr.eval(footprint, ambiguous)
+        # One ray after the other: all of them share one kernel, which is quick to compile.
         for x, y in ((-1, -1), (1, -1), (-1, 1), (1, 1)):
-            snapped = scene.ray_intersect(film_rays(sensor, (offset[0] + x * SNAP, offset[1] + y * SNAP))[0])
-            ambiguous |= _seen_otherwise(si, snapped, footprint)
-            near = film_rays(sensor, (offset[0] + x * rounding, offset[1] + y * rounding))[0]
-            ambiguous |= _in_another_frame(si, scene.ray_intersect(near))
+            snapped = _seen(scene, (offset[0] + x * SNAP, offset[1] + y * SNAP))
+            ambiguous |= _seen_otherwise(seen, snapped, footprint)
+            dr.eval(ambiguous)
+            near = _seen(scene, (offset[0] + x * rounding, offset[1] + y * rounding))
+            ambiguous |= _in_another_frame(seen, near)
+            dr.eval(ambiguous)
         values = {
-            "shape": dr.select(hit, dr.reinterpret_array(mi.UInt32, si.shape), 0),
-            "point": dr.select(hit, si.p, 0),
-            "normal": dr.select(hit, si.n, 0),
-            "front": si.wi.z > 0,
+            "shape": seen["shape"],
+            "point": dr.select(seen["shape"] > 0, seen["point"], 0),
+            "normal": dr.select(seen["shape"] > 0, seen["normal"], 0),
+            "front": seen["height"] > 0,
             "footprint": footprint,
             "ambiguous": ambiguous,
         }
@@ -224,22 +228,43 @@ def _hits(scene: JitArray, grid: int, angle: float) -> list[np.ndarray]:
     return [array.reshape(height * grid, width * grid, *array.shape[4:]) for array in made.values()]
 
 
-def _seen_otherwise(si: JitArray, other: JitArray, footprint: JitArray) -> JitArray:
+def _seen(scene: JitArray, offset: tuple[float, float]) -> dict[str, JitArray]:
+    """What a point of every pixel sees, on the device: shape (0 for none), triangle, place, frame."""
+    import drjit as dr
+    import mitsuba as mi
+
+    si = scene.ray_intersect(film_rays(scene.sensors()[0], offset)[0])
+    seen = {
+        "shape": dr.select(si.is_valid(), dr.reinterpret_array(mi.UInt32, si.shape), 0),
+        "triangle": si.prim_index,
+        "distance": si.t,
+        "point": si.p,
+        "normal": si.n,
+        "height": si.wi.z,
+        "tangent": si.sh_frame.s,
+        "shading": si.sh_frame.n,
+        "uv": si.uv,
+    }
+    dr.eval(seen)
+    return seen
+
+
+def _seen_otherwise(one: dict[str, JitArray], other: dict[str, JitArray], footprint: JitArray) -> JitArray:
     """Whether a ray beside hits what the rasterizer may take for the sample's: another surface, or its other side."""
     import drjit as dr
 
-    both = si.is_valid() & other.is_valid()
-    differs = both & ((si.shape != other.shape) | ((si.wi.z > 0) != (other.wi.z > 0)))
-    step = other.p - si.p
-    away = dr.maximum(dr.abs(dr.dot(si.n, step)), dr.abs(dr.dot(other.n, step)))
-    return (si.is_valid() != other.is_valid()) | differs | (both & (away > NEAR_STEP * footprint))
+    both = (one["shape"] > 0) & (other["shape"] > 0)
+    step = other["point"] - one["point"]
+    away = dr.maximum(dr.abs(dr.dot(one["normal"], step)), dr.abs(dr.dot(other["normal"], step)))
+    differs = ((one["height"] > 0) != (other["height"] > 0)) | (away > NEAR_STEP * footprint)
+    return (one["shape"] != other["shape"]) | (both & differs)
 
 
-def _in_another_frame(si: JitArray, other: JitArray) -> JitArray:
+def _in_another_frame(one: dict[str, JitArray], other: dict[str, JitArray]) -> JitArray:
     """Whether a ray beside hits a triangle whose shading frame or texture coordinates are not the continued ones."""
     import drjit as dr
 
-    turn = dr.norm(other.sh_frame.s - si.sh_frame.s) + dr.norm(other.sh_frame.n - si.sh_frame.n)
-    jump = dr.max(dr.abs(other.uv - si.uv)) > SEAM
-    both = si.is_valid() & other.is_valid()
-    return both & (si.prim_index != other.prim_index) & ((turn > TURN) | jump)
+    turn = dr.norm(other["tangent"] - one["tangent"]) + dr.norm(other["shading"] - one["shading"])
+    jump = dr.max(dr.abs(other["uv"] - one["uv"])) > SEAM
+    both = (one["shape"] > 0) & (other["shape"] > 0)
+    return both & (one["triangle"] != other["triangle"]) & ((turn > TURN) | jump)
