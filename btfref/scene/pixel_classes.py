@@ -179,7 +179,6 @@ def _hits(scene: JitArray, grid: int, angle: float) -> list[np.ndarray]:
         Where another renderer may see something else.
     """
     import drjit as dr
-    import mitsuba as mi
 
     sensor = scene.sensors()[0]
     width, height = (int(k) for k in sensor.film().crop_size())
