@@ -89,6 +89,29 @@ def test_a_mirrored_texture_in_mirrored_light_is_the_mirrored_picture(llvm, fits
     assert same(draw(square(llvm, btf, mirrored, to_uv=turned_over)).image, picture)
 
 
+@pytest.mark.parametrize("draw", [realtime, pytest.param(approximate, marks=pytest.mark.long)])
+@pytest.mark.parametrize("way", ["sh", "transfer"])
+def test_environments_in_the_mirror(llvm, fits, tmp_path, way, draw):
+    """Seen from both sides: a mirrored frame is not the frame of a back."""
+    llvm.set_variant("scalar_rgb")
+    transform, option = llvm.ScalarTransform4f, {realtime: "environment", approximate: "path"}[draw]
+
+    def picture(corners, side, up):
+        path = write_square(tmp_path / "square.obj", corners)
+        scene = square(llvm, fits.path(FIRST), path, to_world=transform().scale([1, 1, up]))
+        del scene["sun"], scene["lamp"]
+        scene["shape"]["bsdf"] = {"type": "twosided", "inner": scene["shape"]["bsdf"]}
+        placed = transform().scale([side, 1, 1]) @ transform().rotate([0, 0, 1], 30)
+        scene["sky"] = {"type": "envmap", "filename": "studio", "to_world": placed}
+        return draw(scene, grid=1, **{option: way}).image
+
+    for up in (1, -1):
+        straight = picture(STRAIGHT, 1, up)
+        assert straight.max() > tolerance("rendered.subject.min_peak")
+        assert same(picture(MIRRORED, -1, up), straight[:, ::-1])
+        assert not same(picture(STRAIGHT, -1, up), straight[:, ::-1])
+
+
 def test_degenerate_coordinates_have_a_stated_frame(llvm, fits, tmp_path):
     """Where u and v span nothing the frame is Mitsuba's around the normal, in all three ways."""
     llvm.set_variant("scalar_rgb")
