@@ -4,7 +4,9 @@
 what         rule
 ============ ==========================================================================================
 directions   ``w_light`` and ``w_view`` are unit vectors away from the surface in the local frame;
-             z is the macro normal, x is ∂p/∂u. A BTF is not reciprocal.
+             z is the macro normal, x is ∂p/∂u made orthogonal to it, y = n × x; where
+             det(∂p/∂u, ∂p/∂v, n) < 0 y = −n × x, so that x and y follow the picture. A BTF is
+             not reciprocal.
 value        ``B = f · cos θ_light`` in 1/sr, linear RGB (Rec. 709), the cosine included.
              0 where either direction is on or below the horizon, or is not finite.
 texels       ``[row, column]``, row 0 at v = 0, texel centres at (i + ½)/n, wrap-around.
@@ -73,14 +75,16 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 class PixelClass(IntEnum):
     """What a pixel shows, and so what two renderers can be asked to agree on; the codes of class maps.
 
-    *Interior* pixels see one smooth surface, *silhouette* pixels an edge of it, *mesostructure* pixels an edge inside
-    a material that has a geometry of its own, *background* pixels nothing.
+    *Interior* pixels see one smooth surface, *edge* pixels an edge of it or are beside one, *silhouette* pixels have a
+    sample so near to an edge that renderers may see different sides of it, *mesostructure* pixels see an edge inside a
+    material that has a geometry of its own, *background* pixels nothing.
     """
 
     BACKGROUND = 0
     INTERIOR = 1
     SILHOUETTE = 2
     MESOSTRUCTURE = 3
+    EDGE = 4
 
     @property
     def label(self) -> str:

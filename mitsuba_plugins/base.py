@@ -17,6 +17,7 @@ from btfref.numerics.footprint import MODES
 from btfref.numerics.sphere.frames import uv_transform
 from btfref.registry import method
 from mitsuba_plugins.lib.footprint import LevelOfDetail
+from mitsuba_plugins.lib.frame import hand_of
 from mitsuba_plugins.lib.guide import LightGuide
 from mitsuba_plugins.lib.lookup import direction_table, valid_directions
 from mitsuba_plugins.lib.proposals import Guided, Mixture
@@ -68,7 +69,7 @@ def make_bsdf() -> type:
         filename   string    the representation, as written by ``btfref fit``
         filter_type string   "bilinear" or "nearest"; default: what the file says
         scale      float     factor of the reflectance, ≥ 0; default 1
-        to_uv      transform of the texture coordinates; its rotation also turns the local frame
+        to_uv      transform of the texture coordinates; its rotation, or reflection, is that of the local frame too
         sampling   string    what proposes light directions: "data", tables of the data; "lobes", the method's own lobes
                              or microfacets; "both", half of each; "cosine", for comparison. Default: what has the least
                              variance for its time, "data" for a method without lobes
@@ -105,7 +106,7 @@ def make_bsdf() -> type:
             own = representation.meta["filter_type"]
             self.filter_type = _choice(props, "filter_type", own, FILTER_TYPES)
             self.scale = mi.Float(_number(props, "scale", 1.0, least=0.0))
-            affine, self.rotation = uv_transform(_matrix(_parameter(props, "to_uv", None)))
+            affine, self.turn = uv_transform(_matrix(_parameter(props, "to_uv", None)))
             # Python floats: NumPy scalars would try to read a symbolic operand.
             self.affine = affine.tolist()
             self.key = representation.meta["method"]
@@ -153,21 +154,26 @@ def make_bsdf() -> type:
 
             return mi.Point2f(*(row(*coefficients) for coefficients in self.affine))
 
-        def _local(self, w: JitArray) -> tuple[JitArray, JitArray]:
+        def _local(self, si: JitArray, w: JitArray) -> tuple[JitArray, JitArray]:
             """A direction in the texture's frame, and whether it is valid; the pole stands in for invalid ones.
 
             Sanitized one by one, so that what depends on the view alone is recorded once for all methods that a
             kernel calls.
             """
-            w = self._turn(w)
+            hand = hand_of(si) * self.turn.hand
+            c, s = self.turn.cosine, self.turn.sine
+            y = hand * w.y
+            if (c, s) != (1.0, 0.0):
+                w = mi.Vector3f(c * w.x - s * y, s * w.x + c * y, w.z)
+            else:
+                w = mi.Vector3f(w.x, y, w.z)
             valid = valid_directions(w)
             return dr.select(valid, w, mi.Vector3f(0, 0, 1)), valid
 
-        def _turn(self, w: JitArray, sign: int = 1) -> JitArray:
-            c, s = self.rotation
-            if s == 0 and c > 0:
-                return mi.Vector3f(w)
-            return mi.Vector3f(c * w.x - sign * s * w.y, sign * s * w.x + c * w.y, w.z)
+        def _mitsubas(self, si: JitArray, w: JitArray) -> JitArray:
+            """A direction of the texture's frame in Mitsuba's."""
+            c, s = self.turn.cosine, self.turn.sine
+            return mi.Vector3f(c * w.x + s * w.y, hand_of(si) * self.turn.hand * (c * w.y - s * w.x), w.z)
 
         @staticmethod
         def _enabled(ctx: JitArray) -> bool:
@@ -212,8 +218,8 @@ def make_bsdf() -> type:
         def _directions(
             self, si: JitArray, wo: JitArray, active: JitArray
         ) -> tuple[JitArray, JitArray, JitArray]:
-            w_view, view_valid = self._local(si.wi)
-            w_light, light_valid = self._local(wo)
+            w_view, view_valid = self._local(si, si.wi)
+            w_light, light_valid = self._local(si, wo)
             return w_view, w_light, mi.Bool(active) & view_valid & light_valid
 
         def eval(self, ctx: JitArray, si: JitArray, wo: JitArray, active: JitArray = True) -> JitArray:
@@ -245,14 +251,14 @@ def make_bsdf() -> type:
             bs = dr.zeros(mi.BSDFSample3f)
             if not self._enabled(ctx):
                 return bs, mi.Color3f(0)
-            w_view, view_valid = self._local(si.wi)
+            w_view, view_valid = self._local(si, si.wi)
             active = mi.Bool(active) & view_valid
             known, proposal = self._view(si, w_view, active)
-            bs.wo = self._turn(proposal.sample(sample1, sample2), -1)
+            bs.wo = self._mitsubas(si, proposal.sample(sample1, sample2))
             bs.eta = 1.0
             bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
             bs.sampled_component = 0
-            w_light, light_valid = self._local(bs.wo)
+            w_light, light_valid = self._local(si, bs.wo)
             active &= light_valid
             value = self._value(ctx, si, w_light, w_view, active, known)
             bs.pdf = proposal.pdf(w_light, active)

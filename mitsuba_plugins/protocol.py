@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 from btfref.types import JitArray
 
 if TYPE_CHECKING:
+    from btfref.numerics.sphere.frames import Turn
     from mitsuba_plugins.base import Maps
 
 
@@ -107,13 +108,16 @@ class ShowsMethod(Protocol):
     Attributes
     ----------
     evaluator : Evaluator
+    turn : Turn
+        Of the local frame, by the transform of the texture.
     """
 
     evaluator: Evaluator
+    turn: Turn
 
 
-def is_displaced(bsdf: JitArray) -> bool:
-    """Whether a BSDF, or one inside of it, finds its values on a geometry of its own.
+def shown_by(bsdf: JitArray) -> list[ShowsMethod]:
+    """Those of a BSDF and of the ones inside of it that are BTFs.
 
     BSDFs of Mitsuba, such as ``twosided``, tell the ones inside of them by their traversal, which hands out the Python
     objects that were put there.
@@ -129,9 +133,11 @@ def is_displaced(bsdf: JitArray) -> bool:
 
     found = [bsdf]
     for one in found:
-        if isinstance(one, ShowsMethod):
-            if isinstance(one.evaluator, Displaced):
-                return True
-        else:
+        if not isinstance(one, ShowsMethod):
             one.traverse(Inner())
-    return False
+    return [one for one in found if isinstance(one, ShowsMethod)]
+
+
+def is_displaced(bsdf: JitArray) -> bool:
+    """Whether a BSDF, or one inside of it, finds its values on a geometry of its own."""
+    return any(isinstance(one.evaluator, Displaced) for one in shown_by(bsdf))

@@ -113,6 +113,10 @@ def run(args: Namespace) -> int:
     else:
         meta = result.meta
         emit(f"{out}: {meta['frame_ms']:.3g} ms a frame on {meta['gl_renderer']}")
+        if meta["mirrored"]:
+            from btfref.scene.mirrored import line
+
+            emit(line(meta["mirrored"]))
         if "estimated_error" in meta:
             number = meta.get("environment_lights", meta.get("order"))
             kind = "lights" if "environment_lights" in meta else "bands"

@@ -81,6 +81,10 @@ def run(args: Namespace) -> int:
         )
     if lost := result.meta.get("not_finite"):
         emit(f"{lost} channels are no numbers: lookups outside of what the file holds, or broken materials")
+    if result.meta.get("mirrored"):
+        from btfref.scene.mirrored import line
+
+        emit(line(result.meta["mirrored"]))
     classes = None
     if classes_out:
         from btfref.scene.pixel_classes import pixel_classes

@@ -43,8 +43,8 @@ class Comparison:
     Parameters
     ----------
     metrics : dict of str to dict of str to float
-        Class (``interior``, ``silhouette``, ``mesostructure``, ``background``, ``all``; those with pixels) → name →
-        number.
+        Class (``interior``, ``edge``, ``silhouette``, ``mesostructure``, ``background``, ``all``; those with pixels) →
+        name → number.
     gates : tuple of GateResult
         ``image.finite`` first, then those asked for.
     settings : dict
@@ -140,8 +140,8 @@ def compare(
     test, reference : path-like, (H, W, 3) array, or an object with ``image`` and perhaps ``variance``
         Linear Rec. 709. Paths are read by `load_image`.
     classes : (H, W) integer array, optional
-        0 background, 1 interior, 2 silhouette, 3 mesostructure. Without it every pixel counts as interior: nothing is
-        excused.
+        0 background, 1 interior, 2 silhouette, 3 mesostructure, 4 edge. Without it every pixel counts as interior:
+        nothing is excused.
     gate : str or sequence of str, optional
         Keys of ``tolerances.toml``; ``image.finite`` is always applied.
     variance : (H, W, 3) array or pair of such, optional
@@ -195,7 +195,7 @@ def compare(
     for kind in PixelClass:
         if kind.label in masks:
             mask = masks[kind.label]
-            relative[mask] = metrics.relative_error(t[mask], r[mask]).max(-1)
+            relative[mask] = metrics.relative_error(t[mask], r[mask])
     maps["relative"] = relative
 
     found = {
@@ -248,7 +248,7 @@ def agreement(
     Parameters
     ----------
     test, reference : (..., C) array
-        Values of one shape; an entry counts by its worst channel.
+        Values of one shape; an entry's error is relative to its largest channel.
     gate : str, optional
         Key of ``tolerances.toml`` with limits among p50, p99, p999, max, rmse, mae, bias and ``floor``.
     allowance : (..., C) array, optional
@@ -271,7 +271,7 @@ def agreement(
     floor = float(gate_table(gate).get("floor", metrics.FLOOR))
     values, worst = {}, None
     if finite.any():
-        error = metrics.relative_error(t[finite], r[finite], floor=floor).max(-1)
+        error = metrics.relative_error(t[finite], r[finite], floor=floor)
         worst = int(np.flatnonzero(finite)[np.argmax(error)])
         values = {name: getattr(metrics, name)(t[finite], r[finite]) for name in ("rmse", "mae", "bias")}
         values |= metrics.percentiles(error)
@@ -338,7 +338,7 @@ def _class_metrics(
     found["max_abs"] = float(np.abs(t - r).max())
     found["psnr"] = metrics.psnr(t, r, peak=peak)
     found["ssim"] = float(ssim.mean())
-    found |= {f"rel_{k}": v for k, v in metrics.percentiles(metrics.relative_error(t, r).max(-1)).items()}
+    found |= {f"rel_{k}": v for k, v in metrics.percentiles(metrics.relative_error(t, r)).items()}
     for name in ("delta_e00", "flip"):
         if name in maps:
             values = maps[name].astype(np.float64)

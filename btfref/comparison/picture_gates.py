@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -41,8 +42,14 @@ def judge_pictures(key: str, comparison: Comparison, masks: Mapping[str, np.ndar
     table = gate_table(key)
     name = table.get("class", PixelClass.INTERIOR.label)
     wanted = [entry.removeprefix("min_") for entry in limits(table)]
-    if name not in (*class_codes(), "all"):
+    names = name.split("+")
+    if not {*names} <= {*class_codes(), "all"}:
         raise InputError("unknown pixel class", file="tolerances.toml", field=f"{key}.class", got=name)
+    mask = np.any([masks[one] for one in names if one in masks], axis=0)
+    covered = comparison.classes != PixelClass.BACKGROUND
+    share = np.count_nonzero(mask & covered) / max(np.count_nonzero(covered), 1)
+    if wanted == ["judged_share"]:
+        return judge(key, {"judged_share": share}, pixel_class=name)
     if wanted == ["nonfinite"]:
         bad = {side: comparison.counts[f"nonfinite_{side}"] for side in ("test", "reference")}
         detail = ", ".join(f"{n} in the {side}" for side, n in bad.items() if n)
@@ -55,13 +62,12 @@ def judge_pictures(key: str, comparison: Comparison, masks: Mapping[str, np.ndar
             },
             pixel_class=name,
         )
-    if name not in masks:
+    if not np.any(mask):
         outcome = "empty" if table.get("may_be_empty") else "fail"
         detail = f"no finite {name} pixels"
         return judge(key, dict.fromkeys(wanted, Measured(None, outcome, detail)), pixel_class=name)
-    return judge(
-        key, {w: _measure(w, name, table, comparison, masks[name]) for w in wanted}, pixel_class=name
-    )
+    found = judge(key, {w: _measure(w, name, table, comparison, mask) for w in wanted}, pixel_class=name)
+    return [replace(gate, judged=share) for gate in found] if name not in ("all", "background") else found
 
 
 def _measure(
@@ -69,7 +75,7 @@ def _measure(
 ) -> float | Measured:
     t, r = (picture[mask] for picture in comparison.pictures)
     if entry in metrics.PERCENTILES or entry == "failing_fraction":
-        error = metrics.relative_error(t, r, floor=table.get("floor", metrics.FLOOR)).max(-1)
+        error = metrics.relative_error(t, r, floor=table.get("floor", metrics.FLOOR))
         if entry == "failing_fraction":
             return float(np.mean(error > table["failing_above"]))
         return metrics.percentiles(error)[entry]
@@ -90,11 +96,11 @@ def _measure(
         if entry == "relative_tile_bias":
             return _tiles(comparison, comparison.variance, mask, table)
         return _equivalence(t, r, v, table)
-    if entry in comparison.metrics[name]:
-        return comparison.metrics[name][entry]
-    raise InputError(
-        "no such measure", file="tolerances.toml", field=entry, expected=sorted(comparison.metrics[name])
-    )
+    known = comparison.metrics.get(name, comparison.metrics["all"])
+    if entry not in known:
+        raise InputError("no such measure", file="tolerances.toml", field=entry, expected=sorted(known))
+    # Of several classes together nothing is measured before a gate asks.
+    return known[entry] if name in comparison.metrics else float(getattr(metrics, entry)(t, r))
 
 
 def _equivalence(t: np.ndarray, r: np.ndarray, variance: np.ndarray, table: Gate) -> Measured:

@@ -23,6 +23,7 @@ _WORDS = {
     "rejected_fraction": ("share of significant differences", "rejected share"),
     "relative_rmse": ("RMSE / mean without noise", "RMSE / mean"),
     "bias_fraction": ("bias / mean", "bias / mean"),
+    "min_judged_share": ("share of covered pixels judged", "judged share"),
 }
 
 
@@ -55,6 +56,8 @@ class GateResult:
         What a failure, or an undecided test, needs as explanation.
     measured : Measured or None
         What the outcome was judged from; None for a result that nobody measured.
+    judged : float or None
+        Share of the covered pixels that the gate looked at; None for gates that are not about those.
     """
 
     name: str
@@ -66,6 +69,7 @@ class GateResult:
     pixel_class: str = ""
     detail: str = ""
     measured: Measured | None = None
+    judged: float | None = None
 
     @property
     def gate(self) -> str:
@@ -76,6 +80,11 @@ class GateResult:
     def entry(self) -> str:
         """The entry within the gate, ``"p999"``."""
         return self.name.rpartition(".")[2]
+
+    @property
+    def pixels(self) -> str:
+        """The class judged and its share of the covered pixels, ``"interior+edge, 97.2 %"``; empty without a class."""
+        return self.pixel_class + ("" if self.judged is None else f", {100 * self.judged:.1f} %")
 
     @property
     def sign(self) -> str:
@@ -95,7 +104,7 @@ class GateResult:
     @property
     def line(self) -> str:
         """The result in one line, for a terminal or a test's message."""
-        where = f" [{self.pixel_class}]" if self.pixel_class else ""
+        where = f" [{self.pixels}]" if self.pixel_class else ""
         value = "no value" if self.value is None else f"{self.value:.4g}"
         detail = f" ({self.detail})" if self.detail else ""
         return f"{self.outcome}: {self.name}{where} {value}, wanted {self.sign} {self.limit:g}{detail}"
@@ -111,6 +120,7 @@ class GateResult:
             "class": self.pixel_class,
             "reason": self.reason,
             "detail": self.detail,
+            "judged": self.judged,
         }
 
     def measurement(self) -> Facts:

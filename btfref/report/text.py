@@ -174,7 +174,7 @@ def gate_list(gates: Iterable[GateResult]) -> str:
     for key, members in groups.items():
         rows = "".join(
             f'<tr class="{gate.outcome}"><th scope="row">{escape(limit_name(gate.entry))}</th>'
-            f"<td>{escape(gate.pixel_class or '–')}</td><td>{escape(number(gate.value))}</td>"
+            f"<td>{escape(gate.pixels or '–')}</td><td>{escape(number(gate.value))}</td>"
             f"<td>{gate.sign} {number(gate.limit)}</td>"
             f"<td>{badge(gate.outcome)}</td></tr>"
             + (

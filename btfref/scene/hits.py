@@ -1,9 +1,11 @@
 """Hits of a surface with a BTF, in the frame in which the BTF is looked up.
 
-The frame is Mitsuba's shading frame ``s = normalize(∂p/∂u − n (n · ∂p/∂u))``, ``t = n × s``, turned about the normal as
-the texture transform turns the texture. On a two-sided surface that is seen from behind both directions are mirrored at
-the surface and the tangents stay, as in Mitsuba's ``twosided``. The same is said for the plugin in
-``mitsuba_plugins/base.py`` and for shaders in ``shaders/lib/surface/frame.glsl``, and nowhere else.
+The frame is Mitsuba's shading frame ``s = normalize(∂p/∂u − n (n · ∂p/∂u))``, ``t = n × s``, its t mirrored where
+det(∂p/∂u, ∂p/∂v, n) < 0, so that s and t follow the picture; then turned about the normal, or mirrored, as the texture
+transform does it to the texture. Where u and v span nothing, Mitsuba's ∂p/∂u and ∂p/∂v stand, those of its frame
+around the geometric normal. On a two-sided surface that is seen from behind both directions are mirrored at the surface
+and the tangents stay, as in Mitsuba's ``twosided``. The same is said for the plugin in ``mitsuba_plugins/base.py`` and
+for shaders in ``shaders/lib/surface/frame.glsl``, and nowhere else.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.footprint import TINY, cone_footprint
-from btfref.numerics.sphere.frames import shading_frame
+from btfref.numerics.sphere.frames import Turn, shading_frame
 from btfref.scene.camera import film_rays, grid_offsets
 from btfref.types import JitArray
 
@@ -58,6 +60,12 @@ class Surface:
         return np.array(self.si.is_valid())
 
     @cached_property
+    def hand(self) -> np.ndarray:
+        """Sign of det(∂p/∂u, ∂p/∂v, n), shape (pixels,): −1 where the texture is mirrored against the surface."""
+        area = np.cross(self["dp_du"], self["dp_dv"])
+        return np.where((area * self["sh_frame.n"]).sum(1) < 0, -1.0, 1.0)
+
+    @cached_property
     def lights(self) -> list[np.ndarray]:
         """Directions towards every delta light in Mitsuba's frame, each of shape (pixels, 3)."""
         import mitsuba as mi
@@ -91,6 +99,8 @@ class Hits:
         Of the shape.
     wi : ndarray, shape (N, 3), or mitsuba.Vector3f
         Towards the viewer, in Mitsuba's shading frame.
+    hand : ndarray, shape (N,), or mitsuba.Float
+        Sign of det(∂p/∂u, ∂p/∂v, n).
     surface : Surface, optional
     at : ndarray of int, shape (N,), optional
         Pixels of the surface that the hits belong to.
@@ -101,17 +111,25 @@ class Hits:
         material: BtfMaterial,
         uv: JitArray,
         wi: JitArray,
+        hand: JitArray,
         *,
         surface: Surface | None = None,
         at: np.ndarray | None = None,
     ) -> None:
-        self.material, self._uv, self._wi = material, uv, wi
+        self.material, self._uv, self._wi, self._hand = material, uv, wi, hand
         self._surface, self._at = surface, at
 
     @classmethod
     def of(cls, surface: Surface, material: BtfMaterial, at: np.ndarray) -> Hits:
         """Those of the pixels ``at`` of a surface, shape (N,) int."""
-        return cls(material, surface["uv"][at], surface["wi"][at], surface=surface, at=at)
+        return cls(material, surface["uv"][at], surface["wi"][at], surface.hand[at], surface=surface, at=at)
+
+    @classmethod
+    def at_interaction(cls, material: BtfMaterial, si: JitArray) -> Hits:
+        """Those of Mitsuba's surface interactions, as Dr.Jit arrays."""
+        from mitsuba_plugins.lib.frame import hand_of
+
+        return cls(material, si.uv, si.wi, hand_of(si))
 
     @property
     def at(self) -> np.ndarray:
@@ -139,7 +157,7 @@ class Hits:
     def local(self, w: JitArray) -> JitArray:
         """Directions of Mitsuba's shading frame, in the texture's frame."""
         x, y, z = _components(w)
-        return _joined(w, *_turned(self.material.rotation, x, y), z * self.side)
+        return _joined(w, *_turned(self.material.turn, x, y * self._hand), z * self.side)
 
     def _field(self, name: str) -> np.ndarray:
         assert self._surface is not None, "hits of no surface"
@@ -154,6 +172,7 @@ class Hits:
     def to_world(self) -> np.ndarray:
         """Columns: axes of the texture's frame in world space, the third one to the side seen; shape (N, 3, 3)."""
         frame = np.stack([self._field(f"sh_frame.{axis}") for axis in "stn"], 1)
+        frame[:, 1] *= self._hand[:, None]
         frame = turned_frame(frame, self.material)
         frame[:, 2] *= self.side[:, None]
         return frame.transpose(0, 2, 1)
@@ -203,8 +222,8 @@ class Hits:
             lod += np.log2(np.clip(distance / material.lod_unit, TINY, 1e30))
         return lod, np.zeros((n, 2)), np.ones(n)
 
-    def place(self, mesh: MeshDescription) -> tuple[np.ndarray, np.ndarray]:
-        """Triangle and barycentric coordinates of every hit.
+    def place(self, mesh: MeshDescription) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Side, triangle and barycentric coordinates of every hit.
 
         Parameters
         ----------
@@ -213,6 +232,8 @@ class Hits:
 
         Returns
         -------
+        behind : ndarray of bool, shape (N,)
+            The back of a two-sided surface is seen.
         triangle : ndarray of int, shape (N,)
         barycentric : ndarray of float64, shape (N, 3)
 
@@ -229,7 +250,7 @@ class Hits:
             raise InputError("a mesh is needed", field=mesh.name, got=mesh.plugin, expected="such as ply")
         else:
             triangle = self._field("prim_index").astype(np.int64)
-        return triangle, _barycentric(corners[triangle], self.position)
+        return self.side < 0, triangle, _barycentric(corners[triangle], self.position)
 
 
 def corner_frames(mesh: MeshDescription) -> np.ndarray:
@@ -241,18 +262,19 @@ def corner_frames(mesh: MeshDescription) -> np.ndarray:
     """
     _, normals, _, dp_du = mesh.corners()
     normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
-    return np.swapaxes(turned_frame(shading_frame(normals, dp_du[:, None]), mesh.btf), -1, -2)
+    frame = shading_frame(normals, dp_du[:, None], mesh.hands())
+    return np.swapaxes(turned_frame(frame, mesh.btf), -1, -2)
 
 
 def turned_frame(frame: np.ndarray, material: BtfMaterial) -> np.ndarray:
-    """Shading frames, rows s, t, n in shape (..., 3, 3), turned about the normal to the texture's frame."""
+    """Frames, rows s, t, n in shape (..., 3, 3), taken to that of the transformed texture."""
     s, t, n = np.moveaxis(frame, -2, 0)
-    return np.stack([*_turned(material.rotation, s, t), n], -2)
+    return np.stack([*_turned(material.turn, s, t), n], -2)
 
 
-def _turned(rotation: tuple[float, float], x: JitArray, y: JitArray) -> tuple[JitArray, JitArray]:
-    """First and second component after a turn, counter-clockwise."""
-    c, s = rotation
+def _turned(turn: Turn, x: JitArray, y: JitArray) -> tuple[JitArray, JitArray]:
+    """First and second component after a turn."""
+    c, s, y = turn.cosine, turn.sine, turn.hand * y
     return (x, y) if (c, s) == (1.0, 0.0) else (c * x - s * y, s * x + c * y)
 
 

@@ -17,10 +17,26 @@ from btfref.types import JitArray, SceneLike
 #: which is far less; a fold in front of another surface leaves it by their distance.
 STEP = 0.25
 
-#: Distance in pixels, along each axis, within which a rasterizer may give a sample to the next triangle:
+#: Distance in pixels, along each axis, within which a rasterizer may decide otherwise whether a sample hits a surface:
 #: vertices are rounded to multiples of 1/256 pixel (Direct3D 11.3 functional specification, 3.4.1; GPUs and
 #: llvmpipe follow it).
 SNAP = 0.5 / 256
+
+#: Angle, in radians, within which two renderers may give a sample to one or the other of two triangles that meet. Which
+#: one the rasterizer draws does not matter, since shaders follow the ray (``lib/surface/triangle_table.glsl``), so that
+#: rounding is left: positions at a distance of some units are good to 5e-7 of it in float32, barycentric coordinates of
+#: small triangles to a few times that.
+ROUNDING = 2e-6
+
+#: Step in depth, in pixels, between rays `SNAP` apart that is an edge: a smooth surface leaves its tangent plane by far
+#: less, unless it is seen at grazing.
+NEAR_STEP = 8 * SNAP
+
+#: z of the view, in the shading frame, below which renderers may differ on which side is seen.
+HORIZON = 1e-5
+
+#: Change of the texture coordinates between rays `ROUNDING` apart that is a seam.
+SEAM = 1e-3
 
 #: Distance in uv, along each axis and both diagonals, within which two renderers may hit different points of a
 #: displaced surface: interpolated texture coordinates round by 1e-6 of their range, which repeats several times.
@@ -30,7 +46,7 @@ HIT = 1e-5
 #: mesostructure (its silhouettes, borders of its shadows) and no rounding.
 EDGE = 1e-3
 
-#: Turn of the tangent frame, in radians, below which the neighbouring triangle shows the same value.
+#: Turn of the shading frame, in radians, below which the neighbouring triangle shows the same value.
 TURN = 1e-4
 
 
@@ -41,17 +57,19 @@ def pixel_classes(
     size: tuple[int, int] | None = None,
     grid: int = 4,
     variant: str = "llvm_ad_rgb",
+    follows_rays: bool = True,
 ) -> np.ndarray:
     """Class of every pixel, from the primary hits of a regular sub-pixel grid.
 
-    A pixel is *silhouette* when samples of it or of its eight neighbours mix hit and miss or several shapes,
-    when the surface jumps in depth between two of them (a fold in front of the cloth itself), or when the
-    view passes the horizon of the shading normal, where B jumps to zero. There, two renderers may see
-    different surfaces at the same sample: rasterizers snap vertices to 1/256 pixel. Hence a pixel is
-    silhouette, too, when one of its samples lies that close to an edge between triangles whose tangent frames
-    differ: ∂p/∂u is constant on a triangle, so B jumps there. *Mesostructure* are the other pixels in which a
-    material with a geometry of its own (a g-BRDF) jumps within `HIT` of a sample, under one of the scene's delta
-    lights. All other pixels that are hit are *interior*.
+    A sample *may be seen otherwise* by another renderer where rays half a step of 1/256 pixel beside it, by which
+    rasterizers snap vertices, hit something else: nothing, another shape, a surface at another depth, or the other side
+    of the shading normal, at whose horizon B jumps to zero; and where rays within float32 rounding hit a triangle with
+    another frame or other texture coordinates, since ∂p/∂u is constant on a triangle and B jumps there. A pixel with
+    such a sample is *silhouette*. An *edge* pixel has none, but its samples or those of its eight neighbours meet an
+    edge: they mix hit and miss or several shapes, the surface jumps in depth between two of them (a fold in front of
+    the cloth itself), or turns away from the view. *Mesostructure* are other pixels in which a material with a
+    geometry of its own (a g-BRDF) jumps within `HIT` of a sample, under one of the scene's delta lights. All other
+    pixels that are hit are *interior*.
 
     Parameters
     ----------
@@ -63,6 +81,9 @@ def pixel_classes(
         n of the n × n samples.
     variant : str
         A JIT variant of Mitsuba.
+    follows_rays : bool
+        Whether the renderer to be judged decides by rays between triangles that meet, as btfref's does. False: by its
+        rasterizer, which snaps inner edges as it does silhouettes.
 
     Returns
     -------
@@ -70,7 +91,9 @@ def pixel_classes(
         Codes of `PixelClass`.
     """
     with loaded(scene, parameters, variant=variant, size=size, sampled=False) as made:
-        shape, point, normal, front, footprint, ambiguous = _hits(made, grid)
+        shape, point, normal, front, footprint, ambiguous = _hits(
+            made, grid, ROUNDING if follows_rays else np.inf
+        )
         jumps = _displaced_edges(made, grid)
     hit = shape > 0
     edge = np.zeros(shape.shape, bool)
@@ -85,11 +108,11 @@ def pixel_classes(
         edge[b] |= differs
     pixels = (shape.shape[0] // grid, grid, shape.shape[1] // grid, grid)
     any_edge = _spread(np.any(edge.reshape(pixels), axis=(1, 3)))
-    any_edge |= np.any(ambiguous.reshape(pixels), axis=(1, 3))
     any_hit = hit.reshape(pixels).any((1, 3))
-    inner = np.where(jumps, PixelClass.MESOSTRUCTURE, PixelClass.INTERIOR)
-    seen = np.where(any_hit, inner, PixelClass.BACKGROUND)
-    return np.where(any_edge, PixelClass.SILHOUETTE, seen).astype(np.uint8)
+    seen = np.where(any_hit, np.where(any_edge, PixelClass.EDGE, PixelClass.INTERIOR), PixelClass.BACKGROUND)
+    seen = np.where(jumps & any_hit, PixelClass.MESOSTRUCTURE, seen)
+    seen = np.where(np.any(ambiguous.reshape(pixels), axis=(1, 3)), PixelClass.SILHOUETTE, seen)
+    return seen.astype(np.uint8)
 
 
 def _displaced_edges(scene: JitArray, grid: int) -> np.ndarray | bool:
@@ -139,8 +162,8 @@ def _spread(mask: np.ndarray) -> np.ndarray:
     return np.any([padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3)], axis=0)
 
 
-def _hits(scene: JitArray, grid: int) -> list[np.ndarray]:
-    """Primary hits on the fine grid.
+def _hits(scene: JitArray, grid: int, angle: float) -> list[np.ndarray]:
+    """Primary hits on the fine grid; between triangles that meet, ``angle`` decides, but no more than `SNAP`.
 
     Returns
     -------
@@ -153,10 +176,9 @@ def _hits(scene: JitArray, grid: int) -> list[np.ndarray]:
     footprint : ndarray of float32
         Size of a pixel at the hit.
     ambiguous : ndarray of bool
-        Within `SNAP` of a triangle with another tangent frame.
+        Where another renderer may see something else.
     """
     import drjit as dr
-    import mitsuba as mi
 
     sensor = scene.sensors()[0]
     width, height = (int(k) for k in sensor.film().crop_size())
@@ -170,22 +192,30 @@ def _hits(scene: JitArray, grid: int) -> list[np.ndarray]:
         "ambiguous": np.zeros(fine, bool),
     }
     offsets = grid_offsets(grid)
+    (ray, _), (beside, _) = (film_rays(sensor, (x, 0.5)) for x in (0.5, 1.5))
+    pixel = dr.norm(ray.d - beside.d)
+    dr.eval(pixel)
+    # Of a pixel, as the angle asks for; a finer triangle than that cannot be told from its neighbours.
+    rounding = min(SNAP, angle / float(np.array(pixel).min()))
     for number, offset in enumerate(offsets):
-        ray, _ = film_rays(sensor, offset)
-        beside, _ = film_rays(sensor, (offset[0] + 1, offset[1]))
-        si = scene.ray_intersect(ray)
-        hit = si.is_valid()
-        ambiguous = dr.zeros(mi.Bool, dr.width(ray))
-        for x, y in ((-SNAP, -SNAP), (SNAP, -SNAP), (-SNAP, SNAP), (SNAP, SNAP)):
-            moved = scene.ray_intersect(film_rays(sensor, (offset[0] + x, offset[1] + y))[0], hit)
-            other = (moved.prim_index != si.prim_index) & moved.is_valid()
-            ambiguous |= other & (dr.norm(moved.sh_frame.s - si.sh_frame.s) > TURN)
+        seen = _seen(scene, offset)
+        footprint = dr.select(seen["shape"] > 0, seen["distance"] * pixel, 0)
+        ambiguous = (seen["shape"] > 0) & (dr.abs(seen["height"]) < HORIZON)
+        dr.eval(footprint, ambiguous)
+        # One ray after the other: all of them share one kernel, which is quick to compile.
+        for x, y in ((-1, -1), (1, -1), (-1, 1), (1, 1)):
+            snapped = _seen(scene, (offset[0] + x * SNAP, offset[1] + y * SNAP))
+            ambiguous |= _seen_otherwise(seen, snapped, footprint)
+            dr.eval(ambiguous)
+            near = _seen(scene, (offset[0] + x * rounding, offset[1] + y * rounding))
+            ambiguous |= _in_another_frame(seen, near)
+            dr.eval(ambiguous)
         values = {
-            "shape": dr.select(hit, dr.reinterpret_array(mi.UInt32, si.shape), 0),
-            "point": dr.select(hit, si.p, 0),
-            "normal": dr.select(hit, si.n, 0),
-            "front": si.wi.z > 0,
-            "footprint": dr.select(hit, si.t * dr.norm(ray.d - beside.d), 0),
+            "shape": seen["shape"],
+            "point": dr.select(seen["shape"] > 0, seen["point"], 0),
+            "normal": dr.select(seen["shape"] > 0, seen["normal"], 0),
+            "front": seen["height"] > 0,
+            "footprint": footprint,
             "ambiguous": ambiguous,
         }
         dr.eval(values)
@@ -195,3 +225,45 @@ def _hits(scene: JitArray, grid: int) -> list[np.ndarray]:
             array = array.T if array.ndim == 2 else array
             made[name][:, j, :, i] = array.reshape(height, width, *array.shape[1:])
     return [array.reshape(height * grid, width * grid, *array.shape[4:]) for array in made.values()]
+
+
+def _seen(scene: JitArray, offset: tuple[float, float]) -> dict[str, JitArray]:
+    """What a point of every pixel sees, on the device: shape (0 for none), triangle, place, frame."""
+    import drjit as dr
+    import mitsuba as mi
+
+    si = scene.ray_intersect(film_rays(scene.sensors()[0], offset)[0])
+    seen = {
+        "shape": dr.select(si.is_valid(), dr.reinterpret_array(mi.UInt32, si.shape), 0),
+        "triangle": si.prim_index,
+        "distance": si.t,
+        "point": si.p,
+        "normal": si.n,
+        "height": si.wi.z,
+        "tangent": si.sh_frame.s,
+        "shading": si.sh_frame.n,
+        "uv": si.uv,
+    }
+    dr.eval(seen)
+    return seen
+
+
+def _seen_otherwise(one: dict[str, JitArray], other: dict[str, JitArray], footprint: JitArray) -> JitArray:
+    """Whether a ray beside hits what the rasterizer may take for the sample's: another surface, or its other side."""
+    import drjit as dr
+
+    both = (one["shape"] > 0) & (other["shape"] > 0)
+    step = other["point"] - one["point"]
+    away = dr.maximum(dr.abs(dr.dot(one["normal"], step)), dr.abs(dr.dot(other["normal"], step)))
+    differs = ((one["height"] > 0) != (other["height"] > 0)) | (away > NEAR_STEP * footprint)
+    return (one["shape"] != other["shape"]) | (both & differs)
+
+
+def _in_another_frame(one: dict[str, JitArray], other: dict[str, JitArray]) -> JitArray:
+    """Whether a ray beside hits a triangle whose shading frame or texture coordinates are not the continued ones."""
+    import drjit as dr
+
+    turn = dr.norm(other["tangent"] - one["tangent"]) + dr.norm(other["shading"] - one["shading"])
+    jump = dr.max(dr.abs(other["uv"] - one["uv"])) > SEAM
+    both = (one["shape"] > 0) & (other["shape"] > 0)
+    return both & (one["triangle"] != other["triangle"]) & ((turn > TURN) | jump)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics.sphere.frames import nearest_rotation
+from btfref.numerics.sphere.frames import Turn, nearest_turn
 from btfref.types import JitArray, PathLike
 
 #: Segments of a full turn of a tessellated sphere, disk or cylinder: chords lie within 4e-5 radii of the
@@ -33,8 +33,7 @@ class BtfMaterial:
     scale : float
         Factor on B.
     to_uv : ndarray, shape (2, 3)
-        Texture coordinates of the lookup are ``to_uv @ (u, v, 1)``; the linear part has a positive
-        determinant.
+        Texture coordinates of the lookup are ``to_uv @ (u, v, 1)``; the linear part is not singular and may mirror.
     twosided : bool
         Inside a ``twosided`` BSDF.
     lod : {"auto", "distance", "none"}
@@ -53,9 +52,9 @@ class BtfMaterial:
     lod_unit: float = 1.0
 
     @property
-    def rotation(self) -> tuple[float, float]:
-        """Cosine and sine of the turn about the normal that takes local directions to the texture's frame."""
-        return nearest_rotation(self.to_uv[:, :2])
+    def turn(self) -> Turn:
+        """What takes local directions to the frame of the transformed texture."""
+        return nearest_turn(self.to_uv[:, :2])
 
 
 @dataclass(frozen=True)
@@ -135,6 +134,25 @@ class MeshDescription:
         else:
             normals = self.normals.astype(float)[self.faces]
         return p, -normals if self.flip else normals, uv, dp_du
+
+    def uv_sides(self) -> np.ndarray:
+        """On which side of each triangle ∂p/∂u × ∂p/∂v points, shape (m,).
+
+        Returns
+        -------
+        ndarray of float64
+            1: to the side from which its corners are counter-clockwise, as where u and v do not span it; −1: the other.
+            The sign of det(∂p/∂u, ∂p/∂v, n) is that of this number times the shading normal's component on that side.
+        """
+        uv = self.uv.astype(float)[self.faces]
+        d0, d1 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+        return np.where(d0[:, 0] * d1[:, 1] < d0[:, 1] * d1[:, 0], -1.0, 1.0)
+
+    def hands(self) -> np.ndarray:
+        """Sign of det(∂p/∂u, ∂p/∂v, n) at the corners of every triangle, shape (m, 3): −1 where uv are mirrored."""
+        p, normals, _, _ = self.corners()
+        side = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+        return np.where(self.uv_sides()[:, None] * (side[:, None] * normals).sum(-1) < 0, -1.0, 1.0)
 
 
 def neighbours(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -121,20 +121,21 @@ def judge_values(
     -------
     failed, explained : ndarray of bool, shape (n,)
     error : ndarray, shape (n,)
-        Relative error of the worst channel, infinite where the value is not finite.
+        Largest error of a channel, relative to the largest channel; infinite where the value is not finite.
     ulps : ndarray, shape (n,)
-        The same in units in the last place of a float32 of the reference's magnitude.
+        The same in units in the last place of a float32 of the largest channel.
     """
     value = np.asarray(value, float)
     finite = np.isfinite(value).all(-1)
     safe = np.where(finite[:, None], value, 0)
     largest = np.abs(reference).max(initial=0)
     # A black BTF has no scale: any value but 0 is then an error of more than any bound.
-    scale = np.maximum(np.abs(reference), max(tolerance(f"{gate}.floor") * largest, np.finfo(float).tiny))
+    size = np.abs(reference).max(-1, keepdims=True)
+    scale = np.maximum(size, max(tolerance(f"{gate}.floor") * largest, np.finfo(float).tiny))
     difference = np.abs(safe - reference)
     with np.errstate(over="ignore"):
         error = np.where(finite, (difference / scale).max(-1), np.inf)
-        ulps = difference / np.spacing(np.maximum(np.abs(reference), 2.0**-126).astype(np.float32))
+        ulps = difference / np.spacing(np.maximum(size, 2.0**-126).astype(np.float32))
     ulps = np.where(finite, ulps.max(-1), np.inf)
     invalid = ~valid_lookups(lookups)
     beyond = error > tolerance(f"{gate}.max")
@@ -178,7 +179,8 @@ def port_agreement(
     reference = representation.evaluate(*points, lod=lod)
     allowance = None
     if isinstance(representation, Spreads):
-        scale = np.maximum(np.abs(reference), 1e-3 * np.abs(reference).max())
+        size = np.abs(reference).max(-1, keepdims=True)
+        scale = np.maximum(size, tolerance(f"{gate}.floor") * size.max())
         differs = (np.abs(np.reshape(value, reference.shape) - reference) > 1e-6 * scale).any(-1)
         allowance = np.zeros_like(reference)
         allowance[differs] = representation.spread(*(a[differs] for a in points))

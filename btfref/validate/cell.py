@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 #: Gates of a picture in real time against the reference under delta lights.
 GATES = (
     "image.noise_free",
+    "image.judged",
     "image.silhouette",
     "image.mesostructure",
     "image.background",
@@ -46,12 +47,15 @@ GATES = (
 
 #: Under an environment, by the way in which it lights in real time.
 ENVIRONMENT_GATES = {
-    "lights": ("image.environment_lights", "image.background"),
-    "prefiltered": ("image.environment", "image.environment_tiles", "image.background"),
+    "lights": ("image.environment_lights", "image.judged", "image.background"),
+    "prefiltered": ("image.environment", "image.environment_tiles", "image.judged", "image.background"),
 }
 
 #: Pixel classes that the waterfall counts: interior, and where the mesostructure's own silhouettes fall.
 COUNTED = (PixelClass.INTERIOR, PixelClass.MESOSTRUCTURE)
+
+#: Pixel classes that are judged strictly.
+STRICT = (PixelClass.INTERIOR, PixelClass.EDGE)
 
 #: Samples per pixel of a reference under an environment at most.
 MOST = 1 << 15
@@ -265,7 +269,7 @@ def _under_environment(path: Path, spec: Spec, views: Views, settings: Settings,
     way = image.meta["environment_path"]
     gates = ENVIRONMENT_GATES[way]
     reference = converged(
-        path, views.classes == PixelClass.INTERIOR, gate=gates, shadows=False, most=MOST, **shared
+        path, np.isin(views.classes, STRICT), gate=gates, shadows=False, most=MOST, **shared
     )
     some = np.zeros(views.classes.shape, bool)
     there = np.flatnonzero(np.isin(views.classes, COUNTED))

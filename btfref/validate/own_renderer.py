@@ -125,7 +125,7 @@ def _render(
     from btfref.scene.pixel_classes import pixel_classes
 
     shared: Facts = {"parameters": parameters, "size": size}
-    made: Facts = {"classes": pixel_classes(path, grid=grid, **shared)}
+    made: Facts = {"classes": pixel_classes(path, grid=grid, follows_rays=False, **shared)}
     if delta:
         return made | {"image": render(path, grid=grid, shadows=shadows, **shared).image}
     result = render(path, spp=spp, with_variance=True, **shared)

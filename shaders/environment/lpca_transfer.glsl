@@ -1,5 +1,5 @@
 // Provides btf_environment of local PCA for one cluster of transfer matrices; hosts add the clusters' pictures up.
-// Expects the samplers below, TRANSFER_*, lpca's texel maps, and the triangle and bin that the host sets.
+// Expects the samplers below, TRANSFER_*, lpca's texel maps, and the side, triangle and bin that the host sets.
 
 #include "representations/lpca.glsl"
 #include "lib/lookup/parabolic_maps.glsl"
@@ -11,7 +11,8 @@ uniform sampler2DArray transfer_clusters;  // place of each of the material's cl
 uniform int transfer_components;           // 1 + matrix components in the table: fewer while the light moves
 uniform int bin;                           // cluster that is drawn; -1: the other lights alone
 
-int transfer_triangle;         // set by the host
+int transfer_side;             // set by the host: 1 where the back of a two-sided surface is seen
+int transfer_triangle;
 vec3 transfer_barycentric;
 
 // Sum over components of coefficients times floats that begin anywhere in a list of RGBA texels.
@@ -54,7 +55,6 @@ vec3 btf_environment(vec2 uv, vec3 w_view, mat3 to_world, float lod) {
             }
         }
     }
-    int side = determinant(to_world) < 0.0 ? 1 : 0;
     Stencil texels = texel_stencil(uv, CLUSTER_DIM0, CLUSTER_DIM1);
     Stencil views = parabolic_stencil(w_view, TRANSFER_SIZE);
     ivec4 id = ivec4(-1);
@@ -99,7 +99,7 @@ vec3 btf_environment(vec2 uv, vec3 w_view, mat3 to_world, float lod) {
                 continue;
             }
             vec2 scale = alpha[j] * (j == 0 ? scales.xy : scales.zw);
-            int first = ((side * TRANSFER_CLUSTERS + bin) * transfer_components + j) * maps;
+            int first = ((transfer_side * TRANSFER_CLUSTERS + bin) * transfer_components + j) * maps;
             for (int v = 0; v < 4; ++v) {
                 int at = first + (id[x] * TRANSFER_SIZE * TRANSFER_SIZE + views.index[v]) * PACKET_COLOURS;
                 for (int c = 0; c < 3; ++c) {

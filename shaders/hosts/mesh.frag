@@ -17,7 +17,7 @@ uniform vec2 film_offset;   // from gl_FragCoord.x and height - gl_FragCoord.y t
 uniform float film_height;
 uniform vec3 uv_row0;       // texture transform: u' = dot(uv_row0, (u, v, 1))
 uniform vec3 uv_row1;
-uniform vec2 uv_rotation;   // cosine and sine of the turn that the texture transform gives to the local frame
+uniform vec3 uv_turn;       // of the local frame by the texture transform: cosine, sine, -1 where it mirrors
 uniform float scale;
 uniform bool two_sided;
 uniform int pass;           // number of this picture among those that add up
@@ -44,7 +44,7 @@ void main() {
     vec2 film = vec2(gl_FragCoord.x, film_height - gl_FragCoord.y) + film_offset;
     vec3 direction = normalize(ray_corner + film.x * ray_right + film.y * ray_down);
     SurfacePoint point = scene_intersect(triangles, triangle, camera_origin, direction);
-    mat3 to_local = frame_turned(shading_frame(point.normal, point.dp_du), uv_rotation);
+    mat3 to_local = frame_turned(shading_frame(point.normal, point.dp_du, point.side), uv_turn);
     vec3 uv1 = vec3(point.uv, 1.0);
     vec2 uv = vec2(dot(uv_row0, uv1), dot(uv_row1, uv1));
     vec3 w_view = to_local * -direction;
@@ -75,6 +75,7 @@ void main() {
     mat3 to_world = transpose(to_local);
     to_world[2] *= side;
 #ifdef HAS_BINS
+    transfer_side = side < 0.0 ? 1 : 0;
     transfer_triangle = point.triangle;
     transfer_barycentric = point.barycentric;
     if (!lit) {

@@ -136,7 +136,8 @@ def test_the_plugin_averages_along_the_footprint(made, fits, llvm, load_plugin, 
     lod, step, ratio = cone_footprint(*gradients, world, [0, 0, 1], angle * distance)
     from btfref.numerics.sphere.frames import uv_transform
 
-    _, (c, s) = uv_transform(np.array(to_uv.matrix))
+    _, turn = uv_transform(np.array(to_uv.matrix))
+    c, s = turn.cosine, turn.sine
 
     def turned(w):
         return np.stack([c * w[..., 0] - s * w[..., 1], s * w[..., 0] + c * w[..., 1], w[..., 2]], -1)

@@ -110,6 +110,24 @@ def test_checker_comes_from_the_file_and_tiles_as_the_texture(llvm, files):
     assert difference.rejected_fraction > tolerance("closing_loop.difference.rejected_fraction")
 
 
+def test_mirrored_tiles_in_mirrored_light_are_the_mirrored_picture(llvm, files):
+    """By symmetry of the plane: camera in the middle, texture and light mirrored."""
+    scene = _scene(llvm, files / "checker.raw.exr", tiles=2.0, origin=(0, -0.9, 1.6))
+    straight = render_geometry(scene, spp=256, seed=3)
+    scene["plane"]["bsdf"]["to_uv"] = llvm.ScalarTransform4f().scale([-2, 2, 1])
+    lit_alike = render_geometry(scene, spp=256, seed=4)
+    scene["light"]["direction"] = [0.3, 0.0, -1.0]
+    mirrored = render_geometry(scene, spp=256, seed=4)
+    rejected = []
+    for one in (mirrored, lit_alike):
+        there = straight.image[:, ::-1], straight.variance[:, ::-1]
+        p = welch_test(one.image, one.variance, *there, n_a=16, n_b=16)[1]
+        found = difference_test(p, significance=tolerance("closing_loop.difference.significance"))
+        rejected.append(found.rejected_fraction)
+    limit = tolerance("closing_loop.difference.rejected_fraction")
+    assert rejected[0] <= limit < rejected[1]
+
+
 def test_same_seed_same_bytes(llvm, files):
     scene = _scene(llvm, files / "checker.raw.exr")
     first, second, other = (render_geometry(scene, spp=4, seed=seed) for seed in (1, 1, 2))

@@ -46,11 +46,11 @@ def write_images(
 
 
 #: Grey levels of a class file in the order of `btfref.conventions.PixelClass`, so that a person sees the classes.
-_CLASS_GREYS = (0, 100, 200, 250)
+_CLASS_GREYS = (0, 100, 200, 250, 150)
 
 
 def save_classes(path: Path, classes: np.ndarray) -> None:
-    """Write pixel classes (see `btfref.scene.pixel_classes`) as a grey PNG: black, dark, light, nearly white."""
+    """Write pixel classes (see `btfref.scene.pixel_classes`) as a grey PNG."""
     import numpy as np
 
     from btfref.images.png import encode_png
@@ -85,5 +85,7 @@ def load_classes(path: PathLike) -> np.ndarray:
     known = list(_CLASS_GREYS)
     if not np.isin(grey, known).all():
         odd = int(grey[~np.isin(grey, known)][0])
-        raise InputError("not pixel classes", file=path, got=f"grey level {odd}", expected=known)
-    return np.searchsorted(known, grey).astype(np.uint8)
+        raise InputError("not pixel classes", file=path, got=f"grey level {odd}", expected=sorted(known))
+    codes = np.zeros(256, np.uint8)
+    codes[known] = range(len(known))
+    return codes[grey]

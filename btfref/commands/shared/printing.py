@@ -177,7 +177,7 @@ def gate_cells(gate: GateResult) -> list[str]:
 
     verdict = "pass" if gate.passed else "FAIL" if gate.outcome == "fail" else gate.outcome.upper()
     limit = f"{gate.sign} {gate.limit:g}"
-    return [gate.gate, gate.pixel_class or "–", limit_name(gate.entry), number(gate.value), limit, verdict]
+    return [gate.gate, gate.pixels or "–", limit_name(gate.entry), number(gate.value), limit, verdict]
 
 
 def bytes_text(n: float) -> str:

@@ -1,6 +1,8 @@
-"""Tangent frames: Mitsuba's shading frame (``SurfaceInteraction.initialize_sh_frame``), and that of a height field."""
+"""Tangent frames: of a surface with texture coordinates, and of a height field."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +16,7 @@ from btfref.types import PathLike
 ROTATION_FLOOR = 0.01
 
 
-def shading_frame(normal: ArrayLike, dp_du: ArrayLike) -> np.ndarray:
+def shading_frame(normal: ArrayLike, dp_du: ArrayLike, hand: ArrayLike = 1.0) -> np.ndarray:
     """Orthonormal frame from a shading normal and the tangent ∂p/∂u.
 
     Parameters
@@ -23,44 +25,61 @@ def shading_frame(normal: ArrayLike, dp_du: ArrayLike) -> np.ndarray:
         Unit shading normal n.
     dp_du : array_like, shape (..., 3)
         Derivative of the position with respect to u; any length, not parallel to the normal.
+    hand : array_like, shape (...)
+        Sign of det(∂p/∂u, ∂p/∂v, n): −1 where the texture is mirrored against the surface.
 
     Returns
     -------
     ndarray, shape (..., 3, 3)
-        Rows s, t, n with ``s = normalize(dp_du − n (n · dp_du))`` and ``t = n × s``: the matrix takes world vectors
-        to the local frame.
+        Rows s, t, n with ``s = normalize(dp_du − n (n · dp_du))`` and ``t = hand · n × s``: the matrix takes world
+        vectors to the local frame. With 1 it is Mitsuba's (``SurfaceInteraction.initialize_sh_frame``); with the sign
+        of the texture s and t run along its axes, whichever way these turn.
     """
     normal, dp_du = np.asarray(normal, float), np.asarray(dp_du, float)
     s = dp_du - normal * (normal * dp_du).sum(-1, keepdims=True)
     s = s / np.linalg.norm(s, axis=-1, keepdims=True)
-    return np.stack([s, np.cross(normal, s), normal], -2)
+    t = np.asarray(hand, float)[..., None] * np.cross(normal, s)
+    return np.stack([s, t, normal], -2)
 
 
-def nearest_rotation(linear: ArrayLike) -> tuple[float, float]:
-    """The rotation nearest to a linear map of texture coordinates (its polar factor).
+@dataclass(frozen=True)
+class Turn:
+    """How local directions reach the frame of a transformed texture: y is mirrored or not, then x and y turn.
 
-    By this angle local directions turn about the normal to reach the frame of a transformed texture.
+    Parameters
+    ----------
+    cosine, sine : float
+        Of the angle about the normal, counter-clockwise.
+    hand : float
+        −1 where y is mirrored first, else 1.
+    """
+
+    cosine: float = 1.0
+    sine: float = 0.0
+    hand: float = 1.0
+
+
+def nearest_turn(linear: ArrayLike) -> Turn:
+    """The rotation or reflection nearest to a linear map of texture coordinates (its polar factor).
 
     Parameters
     ----------
     linear : array_like, shape (2, 2)
-        With a positive determinant.
+        Not singular.
 
     Returns
     -------
-    tuple of float
-        Cosine and sine of the angle.
+    Turn
     """
     (a, b), (c, d) = np.asarray(linear, float).tolist()
-    cosine, sine = a + d, c - b
+    hand = -1.0 if a * d < b * c else 1.0
+    cosine, sine = a + hand * d, c - hand * b
     length = float(np.hypot(cosine, sine))
-    return (cosine / length, sine / length) if length > 0 else (1.0, 0.0)
+    return Turn(cosine / length, sine / length, hand) if length > 0 else Turn()
 
 
-def uv_transform(
-    matrix: ArrayLike, *, file: PathLike | None = None
-) -> tuple[np.ndarray, tuple[float, float]]:
-    """Affine map of texture coordinates and the rotation that it gives to the local frame.
+def uv_transform(matrix: ArrayLike, *, file: PathLike | None = None) -> tuple[np.ndarray, Turn]:
+    """Affine map of texture coordinates and what it does to the local frame.
 
     Parameters
     ----------
@@ -72,25 +91,26 @@ def uv_transform(
     Returns
     -------
     affine : ndarray, shape (2, 3)
-    rotation : tuple of float
-        Cosine and sine of the angle by which local directions turn about the normal to reach the texture's frame:
-        that of the rotation nearest to the linear part.
+    turn : Turn
+        By which local directions reach the texture's frame: that nearest to the linear part.
 
     Raises
     ------
     InputError
-        For a mirroring or singular transform, which would make the local frame left-handed.
+        For a singular transform, or one that is not finite.
     """
     m = np.asarray(matrix, float)
     affine = np.concatenate([m[:2, :2], m[:2, -1:]], 1)
-    if np.linalg.det(affine[:, :2]) <= 0:
+    determinant = affine[0, 0] * affine[1, 1] - affine[0, 1] * affine[1, 0]
+    if not (np.isfinite(affine).all() and determinant != 0):
         raise InputError(
-            "the transform mirrors or is singular",
+            "the transform is singular",
             file=file,
             field="to_uv",
-            expected="a positive determinant",
+            got=affine[:, :2].tolist(),
+            expected="a determinant that is not 0",
         )
-    return affine, nearest_rotation(affine[:, :2])
+    return affine, nearest_turn(affine[:, :2])
 
 
 def surface_frame(surface: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

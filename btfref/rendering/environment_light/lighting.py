@@ -264,8 +264,8 @@ class Lighting:
             *at: np.ndarray, evaluate: Evaluate | None = None, place: Place | None = None
         ) -> np.ndarray:
             assert place is not None
-            uv, w_view, to_world = at
-            return light.radiance(uv, w_view, np.linalg.det(to_world) < 0, *place())
+            uv, w_view, _ = at
+            return light.radiance(uv, w_view, *place())
 
         tables = {
             **light.tables(),

@@ -54,7 +54,7 @@ class Prepared:
     radiance : callable
         ``(uv (N, 2), w_view (N, 3), to_world (N, 3, 3), *, evaluate=None, place=None) -> (N, 3)`` in float64.
         ``evaluate(uv, w_light, w_view, point)`` stands for the representation's own where points have levels of detail:
-        ``point`` are their indices. ``place()`` gives triangles (N,) and barycentric coordinates (N, 3).
+        ``point`` are their indices. ``place()`` is :meth:`btfref.scene.hits.Hits.place` of a mesh.
     facts : dict
         JSON-able: for the picture's ``meta``.
     constants : dict

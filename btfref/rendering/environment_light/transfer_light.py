@@ -238,7 +238,7 @@ class TransferLight:
         self,
         uv: np.ndarray,
         w_view: np.ndarray,
-        mirrored: np.ndarray,
+        behind: np.ndarray,
         triangle: np.ndarray,
         barycentric: np.ndarray,
     ) -> np.ndarray:
@@ -249,7 +249,7 @@ class TransferLight:
         uv : ndarray, shape (N, 2)
         w_view : ndarray, shape (N, 3)
             Local frame, above the horizon.
-        mirrored : ndarray of bool, shape (N,)
+        behind : ndarray of bool, shape (N,)
             The back of a two-sided surface is seen.
         triangle : ndarray of int, shape (N,)
         barycentric : ndarray, shape (N, 3)
@@ -268,7 +268,7 @@ class TransferLight:
                 continue
             texel, texel_weight = conventions.texel_stencil(uv[at], meta["texels"], meta["filter_type"])
             view, view_weight = bilinear_stencil(w_view[at], material.map_size)
-            side = mirrored[at].astype(int)
+            side = behind[at].astype(int)
             for corner in range(3):
                 own = self.transfer.cluster[triangle[at], corner]
                 alpha = self.transfer.weights[triangle[at], corner, :n_j] * barycentric[at, corner, None]

@@ -26,11 +26,11 @@ def material_uniforms(material: BtfMaterial, texels: tuple[int, int], angle: flo
     angle : float
         That a sample subtends, in radians.
     """
-    row0, row1 = material.to_uv
+    (row0, row1), turn = material.to_uv, material.turn
     return {
         "uv_row0": row0,
         "uv_row1": row1,
-        "uv_rotation": material.rotation,
+        "uv_turn": (turn.cosine, turn.sine, turn.hand),
         "scale": material.scale,
         "two_sided": material.twosided,
         "lod_angle": angle if material.lod == "auto" else 0.0,
@@ -50,7 +50,7 @@ def triangle_table(mesh: MeshDescription) -> np.ndarray:
     Returns
     -------
     ndarray of float32, shape (m, 8, 4)
-        Three positions with u, three normals with v, dp/du, neighbours.
+        Three positions with u, three normals with v, dp/du with the side of dp/du x dp/dv, neighbours.
     """
     positions, normals, uv, dp_du = mesh.corners()
     if len(positions) > 1 << 24:
@@ -60,6 +60,7 @@ def triangle_table(mesh: MeshDescription) -> np.ndarray:
     table[:, 3:6, :3], table[:, 3:6, 3] = normals, uv[..., 1]
     # Only the direction counts; unit length keeps float32 far from overflow.
     table[:, 6, :3] = dp_du / np.linalg.norm(dp_du, axis=-1, keepdims=True)
+    table[:, 6, 3] = mesh.uv_sides()
     table[:, 7, :3] = neighbours(mesh.positions, mesh.faces)
     return table
 

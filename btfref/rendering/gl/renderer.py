@@ -28,6 +28,7 @@ from btfref.rendering.gl.raster import (
 )
 from btfref.scene.demand import MARGIN, kept_maps, number_kept
 from btfref.scene.description import SceneDescription, read_scene
+from btfref.scene.mirrored import mirrored_meshes
 from btfref.types import Facts, JitArray, SceneLike
 
 if TYPE_CHECKING:
@@ -93,11 +94,12 @@ def realtime(
     -------
     RenderResult
         A sample's footprint, and so the level of detail of methods that have levels, is that of 1/n of a pixel.
-        ``meta["frame_ms"]`` is the median time of one frame (one sample a pixel), GPU timer and wall clock
-        whichever is longer; ``gl_vendor``, ``gl_renderer``, ``gl_version``; ``negative_fraction``, the share
-        of channels below zero, and ``not_finite``, their number: nothing is clamped; ``kept``, how many maps
-        were kept by file. With an environment ``environment_path``, the way taken, and what it says of itself,
-        such as ``environment_lights`` and their ``estimated_error``; by file where there are several.
+        ``meta["mirrored"]`` names the shapes whose texture is mirrored; ``meta["frame_ms"]`` is the median time of one
+        frame (one sample a pixel), GPU timer and wall clock whichever is longer; ``gl_vendor``, ``gl_renderer``,
+        ``gl_version``; ``negative_fraction``, the share of channels below zero, and ``not_finite``, their number:
+        nothing is clamped; ``kept``, how many maps were kept by file. With an environment ``environment_path``, the way
+        taken, and what it says of itself, such as ``environment_lights`` and their ``estimated_error``; by file where
+        there are several.
 
     Raises
     ------
@@ -143,6 +145,7 @@ def realtime(
             "lights": len(scene.lights),
             "environment": scene.environment.name if scene.environment else None,
             "kept": number_kept(needed),
+            "mirrored": mirrored_meshes(scene.meshes),
             **renderer.environment_facts,
             **device.facts(renderer.ctx),
         }

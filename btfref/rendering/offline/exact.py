@@ -270,7 +270,7 @@ def _intersect(
 
     ray, _ = film_rays(scene.sensors()[0], offset, pixel)
     si = scene.ray_intersect(ray)
-    hits = Hits(material, si.uv, si.wi)
+    hits = Hits.at_interaction(material, si)
     lights = []
     for emitter in distant_or_delta(scene):
         sample, power = emitter.sample_direction(si, chosen, si.is_valid())

@@ -261,9 +261,9 @@ def _plane(description: SceneDescription) -> _Plane:
         normal = np.asarray(mesh.normals, np.float64).mean(0)
     normal = normal / np.linalg.norm(normal) * (-1 if mesh.flip else 1)
     linear = np.asarray(material.to_uv, np.float64)[:, :2]
-    if np.cross(x, y) @ normal <= 0 or linear[0, 0] <= 0 or abs(linear[1, 0]) > _SLACK * linear[0, 0]:
-        # Whole tiles cannot fill a shape whose border runs across them.
-        raise InputError("tiles are turned or mirrored", file=source, field="to_uv", got=linear.tolist())
+    if abs(linear[1, 0]) > _SLACK * abs(linear[0, 0]):
+        # Whole tiles cannot fill a shape whose border runs across them; mirrored ones can.
+        raise InputError("tiles are turned", file=source, field="to_uv", got=linear.tolist())
     return _Plane(origin, x, y, normal, size, tile.min(0), tile.max(0), material.filename)
 
 

@@ -15,6 +15,7 @@ from btfref.sampling.variant import no_collection
 from btfref.scene.camera import tell_camera
 from btfref.scene.demand import MARGIN, kept_maps, number_kept
 from btfref.scene.loading import loaded
+from btfref.scene.mirrored import seen_mirrored
 from btfref.types import Facts, JitArray, SceneLike
 
 #: Independent renders whose spread gives the variance of the mean: 15 degrees of freedom.
@@ -75,6 +76,7 @@ def render(
     Returns
     -------
     RenderResult
+        ``meta["mirrored"]``: names of the shapes whose texture is seen mirrored.
 
     Raises
     ------
@@ -99,6 +101,8 @@ def render(
     sampled = grid is None or with_variance
     with loaded(scene, parameters, variant=variant, size=size, kept=kept, sampled=sampled) as made:
         found = traced(made, spp=spp, seed=seed, grid=grid, shadows=shadows, with_variance=with_variance)
+        if not variant.startswith("scalar"):
+            found.meta["mirrored"] = seen_mirrored(made)
     lost = found.meta["not_finite"]
     if lost and (debug or kept):
         cause = "needed maps that were not loaded; render with all maps" if kept else "are no numbers"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +22,7 @@ from btfref.stress.evaluators import DEFINITION, PORTS, DrJit, evaluator
 from btfref.stress.judging import port_agreement
 from btfref.stress.lookups import USUAL, hard_lookups, hemisphere
 from btfref.types import Facts
-from btfref.validate.cell import ENVIRONMENT_GATES, GATES
+from btfref.validate.cell import ENVIRONMENT_GATES, GATES, STRICT
 from btfref.validate.method_gates import sampling_gates
 from btfref.validate.own_renderer import EIGHT_BIT, NOISY
 
@@ -147,6 +148,8 @@ class Bench:
 
         scene, parameters, expected, classes = self.reference(subject)
         image = realtime(scene, parameters=parameters, **SETTINGS).image
+        if change == "silhouettes":
+            classes = np.where(np.indices(classes.shape).sum(0) % 4 == 0, PixelClass.SILHOUETTE, classes)
         if change == "background":
             image = np.where(classes[..., None] == PixelClass.BACKGROUND, image + 0.01, image)
         return compare(image, expected, classes=classes, gate=GATES, flip=False).gates
@@ -165,7 +168,7 @@ class Bench:
         gates = ENVIRONMENT_GATES[made.meta["environment_path"]]
         if subject not in self._converged:
             classes = pixel_classes(scene, **shared)
-            found = converged(scene, classes == PixelClass.INTERIOR, gate=gates, shadows=False, **shared)
+            found = converged(scene, np.isin(classes, STRICT), gate=gates, shadows=False, **shared)
             self._converged[subject] = found, classes
         (reference, classes), image = self._converged[subject], made.image.copy()
         if change == "tile":
@@ -198,6 +201,24 @@ class Bench:
         image = 1.05 * expected if change == "bright" else expected
         variance = np.full(expected.shape, sigma**2)
         return compare(image, reference, classes=classes, gate=NOISY, variance=variance, flip=False).gates
+
+    def witness(self, subject: Subject, change: str = "") -> Gates:
+        """Both renderers against the witness, and against each other; the fault is the same in both."""
+        import mitsuba_plugins.base as plugin
+        from btfref.validate.self_test import edited_shader
+        from btfref.validate.witness.gates import testify
+
+        path, hand_of = self.fit(subject)[1], plugin.hand_of
+        right, wrong = "dot(side, normal) < 0.0 ? -1.0 : 1.0", "1.0"
+        with ExitStack() as faults:
+            if change == "hand":
+                plugin.hand_of = lambda si: 1.0
+                faults.callback(setattr, plugin, "hand_of", hand_of)
+                faults.enter_context(
+                    edited_shader(self.folder / "hand", "lib/surface/frame.glsl", right, wrong)
+                )
+            found = testify(path)
+        return [*found.gates(), *found.between()]
 
     def probes(self, subject: Subject) -> Gates:
         """The shader against the definition, at all levels of detail where there are any."""

@@ -125,6 +125,9 @@ FAULTS = (
         "picture",
         edit=("hosts/mesh.vert", "vec4(position, 1.0);", "vec4(position, 1.0) + vec4(0.014, 0.0, 0.0, 0.0);"),
     ),
+    Fault(
+        "a quarter of the pixels left out", "image.judged.min_judged_share", "picture", change="silhouettes"
+    ),
     Fault("light leaks into the background", "image.background.max_abs", "picture", change="background"),
     Fault(
         "the view meets the height field one cell off",
@@ -169,6 +172,12 @@ FAULTS = (
         "environment",
         "rf_lobes",
         change="tile",
+    ),
+    Fault(
+        "mirrored textures lit for the other hand by both renderers",
+        "image.witness.p999",
+        "witness",
+        change="hand",
     ),
     Fault("density of another view", "chi2.rejected.tests", "sampling", change="density"),
     Fault("weight that is not value over density", "sample.weight.max", "sampling", change="weight"),

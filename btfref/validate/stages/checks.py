@@ -50,10 +50,11 @@ def _measured(cache: Cache, mesostructure: str, key: str, settings: Settings) ->
     from btfref.registry import method
     from btfref.representations.file.container import read_info
     from btfref.validate.method_gates import probe_gates, sampling_gates
+    from btfref.validate.witness.gates import testify
 
     start = time.perf_counter()
     file = make_fit(cache, mesostructure, key, settings)
-    gates = probe_gates(file)
+    gates = [*probe_gates(file), *testify(file).gates()]
     gates += sampling_gates(file, samples=settings.chi2_samples, intervals=settings.chi2_intervals)
     btf = load_material(make_material(cache, mesostructure, settings)[0])
     error = held_out_error(method(key).fit, btf, texels=settings.held_out_texels)

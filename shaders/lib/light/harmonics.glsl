@@ -52,7 +52,7 @@ void harmonic_about_x(inout vec3 a[HARMONICS], bool transposed) {
 }
 
 // R = Rz(alpha) Ry(beta) Rz(gamma), a rotation about y being one about z between quarter turns; columns of to_world are
-// the local axes, the third one mirrored where the back is seen. As btfref/numerics/sphere/harmonics.py.
+// the local axes, mirrored where the back or a mirrored texture is seen. As btfref/numerics/sphere/harmonics.py.
 void harmonic_rotated(mat3 to_world, out vec3 a[HARMONICS]) {
     for (int i = 0; i < HARMONICS; ++i) {
         a[i] = table_fetch(environment_harmonics, i).rgb;

@@ -1,5 +1,5 @@
 // Provides scene_intersect: the exact point where a ray meets a mesh, given a triangle that it meets or just misses.
-// Expects triangles of eight texels written by btfref.rendering.gl.renderer: positions, normals, uv, dp/du, neighbours.
+// Expects triangles of eight texels written by btfref.rendering.gl.renderer: positions, normals, uv, dp/du, side, neighbours.
 
 #include "lib/lookup/table.glsl"
 
@@ -11,6 +11,7 @@ struct SurfacePoint {
     vec3 dp_du;
     vec2 uv;
     vec3 plane_normal;  // of the triangle, unit length
+    vec3 side;          // the same or its opposite: where dp/du x dp/dv points
     vec3 gradient_u;    // change of u and v per unit length in the triangle's plane
     vec3 gradient_v;
     int triangle;       // and the place in it
@@ -65,7 +66,8 @@ SurfacePoint scene_intersect(sampler2DArray triangles, int rasterized, vec3 orig
     s.normal = normalize(n_a.xyz * at_point.x + n_b.xyz * at_point.y + n_c.xyz * at_point.z);
     vec2 uv_a = vec2(a.w, n_a.w);
     s.uv = uv_a + at_point.y * (vec2(b.w, n_b.w) - uv_a) + at_point.z * (vec2(c.w, n_c.w) - uv_a);
-    s.dp_du = table_fetch(triangles, at + 6).xyz;
+    vec4 tangent = table_fetch(triangles, at + 6);
+    s.dp_du = tangent.xyz;
     vec3 edge1 = b.xyz - a.xyz, edge2 = c.xyz - a.xyz, area = cross(edge1, edge2);
     float squared = max(dot(area, area), 1e-37);
     vec2 uv1 = vec2(b.w, n_b.w) - uv_a, uv2 = vec2(c.w, n_c.w) - uv_a;
@@ -74,6 +76,7 @@ SurfacePoint scene_intersect(sampler2DArray triangles, int rasterized, vec3 orig
     s.gradient_u = uv1.x * of_b + uv2.x * of_c;
     s.gradient_v = uv1.y * of_b + uv2.y * of_c;
     s.plane_normal = area * inversesqrt(squared);
+    s.side = tangent.w * s.plane_normal;
     s.triangle = triangle;
     s.barycentric = at_point;
     return s;

@@ -325,7 +325,9 @@ def test_compare_prints_gates_and_decides(tmp_path, capsys):
     a, b, c = (str(tmp_path / f"{name}.exr") for name in "abc")
     assert main(["compare", b, a, "--gate", "image.noise_free"]) == 0
     assert re.search(
-        r"^image\.noise_free +interior .* ≤ 0\.001 +pass$", capsys.readouterr().out, re.MULTILINE
+        r"^image\.noise_free +interior\+edge, 100\.0 % .* ≤ 0\.001 +pass$",
+        capsys.readouterr().out,
+        re.MULTILINE,
     )
     assert main(["compare", c, a, "--gate", "image.noise_free"]) == 1
     assert "FAIL  image.noise_free" in capsys.readouterr().out
@@ -351,12 +353,14 @@ def test_rows_of_gates_name_measure_class_and_limit():
     lines = list(demo.lines(DemoResult(cells, "report.html", {"fit": 1.0})))
     rows = [" ".join(line.split()) for line in lines]
     assert rows[0].split() == ["cell", "gate", "pixels", "measure", "value", "limit"]
-    assert rows[2] == "raw against geometry geometry.image interior bias / mean 0.1 ≤ 0.2 pass"
-    assert rows[3] == "sphere image.noise_free interior 99.9 % relative error 0.0004 ≤ 0.001 pass"
+    assert rows[2] == "raw against geometry geometry.image interior, 100.0 % bias / mean 0.1 ≤ 0.2 pass"
+    assert (
+        rows[3] == "sphere image.noise_free interior+edge, 100.0 % 99.9 % relative error 0.0004 ≤ 0.001 pass"
+    )
     assert rows[4].endswith("FAIL")
     shown = [" ".join(line.split()) for line in compare.lines(exact)]
     assert "gate pixels measure value limit" in shown
-    assert "image.noise_free interior largest relative error 0.0004 ≤ 0.01 pass" in shown
+    assert "image.noise_free interior+edge, 100.0 % largest relative error 0.0004 ≤ 0.01 pass" in shown
 
 
 def test_a_fault_names_the_class_of_pixels_that_its_gate_judges():
@@ -364,8 +368,8 @@ def test_a_fault_names_the_class_of_pixels_that_its_gate_judges():
 
     limits = ("image.noise_free.p999", "probe.agreement.max")
     assert Caught("x", limits[0], True, limits, ()).row == [
-        *("x", "image.noise_free.p999 [interior]", "caught"),
-        "image.noise_free.p999 [interior], probe.agreement.max",
+        *("x", "image.noise_free.p999 [interior+edge]", "caught"),
+        "image.noise_free.p999 [interior+edge], probe.agreement.max",
     ]
 
 

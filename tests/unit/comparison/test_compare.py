@@ -80,7 +80,24 @@ def test_one_bad_pixel_fails_the_hard_maximum_alone(scene):
     gate = found.gates[-1]
     assert gate.value > gate.limit
     assert gate.reason == reason("image.noise_free")
-    assert gate.line.startswith("fail: image.noise_free.max [interior] 0.03, wanted ≤ 0.01")
+    share = (classes == PixelClass.INTERIOR).sum() / (classes != PixelClass.BACKGROUND).sum()
+    where = f"[interior+edge, {100 * share:.1f} %]"
+    assert gate.line.startswith(f"fail: image.noise_free.max {where} 0.03, wanted ≤ 0.01")
+
+
+def test_edge_pixels_are_judged_as_strictly_as_interior_ones_and_the_share_has_a_gate(scene):
+    reference, classes = scene
+    outer = classes == PixelClass.SILHOUETTE
+    test = reference.copy()
+    test[outer] *= 1 + 3 * tolerance("image.noise_free.max")
+    gates = ["image.noise_free", "image.judged"]
+    assert names(compare(test, reference, classes=classes, gate=gates).gates) == {
+        "image.judged.min_judged_share"
+    }
+    as_edge = np.where(outer, PixelClass.EDGE, classes)
+    found = compare(test, reference, classes=as_edge, gate=gates)
+    assert names(found.gates) == {"image.noise_free.p999", "image.noise_free.max"}
+    assert {gate.judged for gate in found.gates if gate.gate == "image.noise_free"} == {1.0}
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

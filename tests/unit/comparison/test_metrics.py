@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from btfref.comparison import colour, metrics, significance
+from btfref.comparison import colour, compare, metrics, significance
+from btfref.comparison.comparison import agreement
 from btfref.comparison.flip import aces, exposure_range, flip_map, ldr_flip_map
 from btfref.conventions import LUMINANCE
 from btfref.errors import InputError
@@ -105,7 +106,7 @@ def test_ssim_of_a_picture_smaller_than_the_window():
 
 
 def test_relative_error_has_a_floor():
-    t, r = np.array([1.1, 0.01, 0.0, 5e-4]), np.array([1.0, 0.0, 0.0, 0.0])
+    t, r = (np.array(x)[:, None] for x in ([1.1, 0.01, 0.0, 5e-4], [1.0, 0.0, 0.0, 0.0]))
     np.testing.assert_allclose(
         metrics.relative_error(t, r, floor=1e-2),
         [0.1, 1.0, 0.0, 0.05],
@@ -113,6 +114,20 @@ def test_relative_error_has_a_floor():
     )
     assert metrics.relative_error(np.ones(1), np.zeros(1)) == np.inf
     assert metrics.relative_error(np.zeros(1), np.zeros(1)) == 0
+
+
+def test_relative_error_is_of_the_colour():
+    """A channel that passes through zero beside a highlight counts as a share of the colour, in every gate alike."""
+    reference = np.array([[2.0, 1.0, 0.0], [0.0, 0.0, 0.5], [1.0, 1.0, 1.0]])
+    test = reference + np.array([[0, 0, 1e-4], [0, -5e-5, 0], [0, 0, 1e-4]])
+    expected = np.array([5e-5, 1e-4, 1e-4])
+    rtol = tolerance("metric.library.rtol")
+    np.testing.assert_allclose(metrics.relative_error(test, reference), expected, rtol=rtol)
+    largest = expected.max()
+    assert agreement(test, reference).metrics["all"]["max"] == pytest.approx(largest, rel=rtol)
+    picture = [image.reshape(1, 3, 3) for image in (test, reference)]
+    found = compare(*picture, flip=False)
+    assert found.metrics["all"]["rel_max"] == pytest.approx(largest, rel=rtol)
 
 
 def test_percentiles_are_entries():

@@ -44,7 +44,7 @@ def test_failures_decide_before_doubts_and_doubts_before_what_is_near_its_limit(
 def test_names():
     assert limit_name("p999") == "99.9 % relative error"
     assert limit_name("min_some_thing", short=True) == "some thing"
-    assert with_class("image.noise_free.p999") == "image.noise_free.p999 [interior]"
+    assert with_class("image.noise_free.p999") == "image.noise_free.p999 [interior+edge]"
     assert with_class("probe.agreement.max") == "probe.agreement.max"
 
 

@@ -61,21 +61,22 @@ def test_bad_parameters_name_the_field(fits, llvm, load_plugin, parameters, fiel
         load_plugin(fits.path("raw"), **parameters)
 
 
-def test_mirroring_transforms_are_refused(fits, llvm, load_plugin):
-    with pytest.raises(RuntimeError, match="mirrors"):
-        load_plugin(fits.path("raw"), to_uv=llvm.ScalarTransform4f().scale([-1, 1, 1]))
+def test_singular_transforms_are_refused(fits, llvm, load_plugin):
+    with pytest.raises(RuntimeError, match="singular"):
+        load_plugin(fits.path("raw"), to_uv=llvm.ScalarTransform4f().scale([0, 1, 1]))
 
 
-def test_scale_and_transform(fits, llvm, load_plugin, rng):
-    """``scale`` multiplies; ``to_uv`` moves the texture, and its rotation turns the local frame."""
+@pytest.mark.parametrize("hand", [1, -1])
+def test_scale_and_transform(fits, llvm, load_plugin, rng, hand):
+    """``scale`` multiplies; ``to_uv`` moves the texture, and its rotation or reflection turns the local frame."""
     mi = llvm
     representation = load(fits.path("raw"))
     uv, w_light, w_view = probe_points(rng, 2000, representation)
     uv = np.mod(uv, 1).astype(np.float32)
-    transform = mi.ScalarTransform4f().translate([0.3, 0.1, 0]).rotate([0, 0, 1], 30).scale([2, 2, 1])
+    transform = mi.ScalarTransform4f().translate([0.3, 0.1, 0]).rotate([0, 0, 1], 30).scale([2, 2 * hand, 1])
     got = value(mi, load_plugin(fits.path("raw"), scale=2.5, to_uv=transform), uv, w_light, w_view)
     angle = np.radians(30)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) * [1, hand]
 
     def turned(w):
         return np.concatenate([w[:, :2] @ turn.T, w[:, 2:]], 1)

@@ -19,13 +19,13 @@ def write_square(path, uv):
     )
 
 
-def classes_of(mi, path, size=16):
+def classes_of(mi, path, size=16, **shape):
     view = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": size, "height": size}
     scene = {
         "type": "scene",
         "sensor": {"type": "perspective", "fov": 30, "to_world": view, "film": film},
-        "square": {"type": "ply", "filename": str(path)},
+        "square": {"type": "ply", "filename": str(path), **shape},
         "light": {"type": "point", "position": [0, 0, 3]},
     }
     return pixel_classes(scene, grid=2)
@@ -47,3 +47,20 @@ def test_samples_on_an_edge_between_tangent_frames_are_ambiguous(fourth, turned,
     )
     assert (classes[~diagonal] == PixelClass.INTERIOR).all()
     assert (classes[diagonal] == (PixelClass.SILHOUETTE if turned else PixelClass.INTERIOR)).all()
+
+
+def test_an_edge_is_judged_strictly_but_where_a_sample_lies_on_it(llvm, tmp_path):
+    """The left and right borders of a square run through samples, or between them."""
+    llvm.set_variant("scalar_rgb")
+    write_square(tmp_path / "square.ply", [(0, 0), (1, 0), (1, 1), (0, 1)])
+    # At a distance of 4, 16 pixels show 2 · 4 · tan 15°; samples lie at quarters of pixels.
+    pixel = 8 * np.tan(np.radians(15)) / 16
+    for columns, expected in ((8.5, PixelClass.SILHOUETTE), (8.0, PixelClass.EDGE)):
+        scale = columns * pixel / 4
+        classes = classes_of(
+            llvm, tmp_path / "square.ply", to_world=llvm.ScalarTransform4f().scale([scale, 1, 1])
+        )
+        left, right = (int(side) for side in (8 - columns / 2, 8 + columns / 2 - 1e-3))
+        assert (classes[:, [left, right]] == expected).all()
+        assert (classes[:, left + 3 : right - 2] == PixelClass.INTERIOR).all()
+        assert (classes[:, : left - 1] == PixelClass.BACKGROUND).all()

@@ -5,7 +5,7 @@ import pytest
 
 from btfref.errors import InputError
 from btfref.gates import tolerance
-from btfref.numerics.sphere.frames import shading_frame
+from btfref.numerics.sphere.frames import Turn, shading_frame
 from btfref.scene.description import read_scene
 from btfref.scene.shapes import BtfMaterial, neighbours
 from btfref.scene.shipped import meshes
@@ -155,7 +155,9 @@ def test_material_and_parameters(mi, write, tmp_path, monkeypatch):
     assert (a.material.scale, a.material.twosided) == (0.5, True)
     assert np.abs(a.material.to_uv - [[0, -3, 0.25], [2, 0, 0]]).max() < tolerance("scene.light.max")
     # The nearest rotation to [[0, -3], [2, 0]] is a quarter turn.
-    assert np.abs(np.array(a.material.rotation) - [0, 1]).max() < tolerance("scene.light.max")
+    turn = a.material.turn
+    found = np.array([turn.cosine, turn.sine, turn.hand])
+    assert np.abs(found - [0, 1, 1]).max() < tolerance("scene.light.max")
 
 
 RECTANGLE = '<shape type="rectangle"/>'
@@ -175,12 +177,12 @@ BAD = {
         % ('"filter_type"', '"cubic"'),
         "cubic",
     ),
-    "mirrored texture": (
+    "singular texture transform": (
         SENSOR
         + '<shape type="rectangle">'
-        + MATERIAL.format('<transform name="to_uv"><scale x="-1"/></transform>')
+        + MATERIAL.format('<transform name="to_uv"><scale x="0"/></transform>')
         + "</shape>",
-        "mirrors",
+        "singular",
     ),
     "missing BTF": (
         SENSOR
@@ -247,7 +249,7 @@ def test_neighbours_of_a_closed_mesh_are_mutual(mi):
 
 
 def test_rotation_of_a_scaled_texture_is_none():
-    assert BtfMaterial("", None, 1.0, np.array([[4.0, 0, 0], [0, 4, 0]]), False).rotation == (1.0, 0.0)
+    assert BtfMaterial("", None, 1.0, np.array([[4.0, 0, 0], [0, 4, 0]]), False).turn == Turn()
 
 
 @pytest.mark.parametrize("name", sorted(meshes.SURFACES))
