@@ -303,7 +303,7 @@ def store(
     }
     meta["index_bytes"] = {"index": 1 if index.max() < 256 else 2}
     step("scales")
-    moments, weighted = _moments(btf, arrays, meta["constants"], half_scale, factors.exponent)
+    moments, weighted = _moments(btf, arrays, meta["constants"], scale, half_scale, factors.exponent)
     error = _error(moments, scale)
     if storing.rescale:
         scale = _fitted_scale(weighted, scale)
@@ -318,9 +318,14 @@ def store(
 
 
 def _moments(
-    btf: SampledBTF, arrays: dict[str, np.ndarray], constants: Facts, half_scale: np.ndarray, exponent: float
+    btf: SampledBTF,
+    arrays: dict[str, np.ndarray],
+    constants: Facts,
+    scale: np.ndarray,
+    half_scale: np.ndarray,
+    exponent: float,
 ) -> tuple[Moments, Moments]:
-    """Inner products of data and unscaled terms, per texel and channel: plain ones and weighted ones.
+    """Inner products of data and unscaled terms, per texel and channel: plain ones, and weighted by the scaled terms.
 
     Returns
     -------
@@ -346,7 +351,9 @@ def _moments(
         half = operators.half(factors)
         p, r = operators.read("p", factors["p"]), operators.read("r", factors["r"])
         terms = np.stack([half * a[:, None] * b for a, b in zip(r, p, strict=True)])
-        for part, weight in zip(parts, (1, sample_weights(data, exponent)), strict=True):
+        amount = np.moveaxis(scale[texels], 0, 1).reshape(len(terms), -1) / np.where(mean > 0, mean, 1)
+        model = np.einsum("kvlm,km->vlm", terms, amount.astype(np.float32))
+        for part, weight in zip(parts, (1, sample_weights(model, exponent)), strict=True):
             heavy = weight * terms
             scale = mean.astype(float)
             part.append(

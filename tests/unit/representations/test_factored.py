@@ -129,9 +129,40 @@ def test_sweeps_never_raise_the_error():
     errors = []
     for _ in range(5):
         errors.append(((resampling.through_maps.product(factors) - data) ** 2).sum(dtype=float))
-        factors = factoring.refine(data, factors, resampling.through_maps, 1)
+        factors = factoring.refine([factoring.Samples(data, resampling.through_maps)], factors, 1)
         assert min(f.min() for f in factors.values()) >= 0
     assert (np.diff(errors) < 0).all()
+
+
+def test_listed_pairs_are_read_as_the_grid_is(rng):
+    """All pairs of a grid, as a list: the same products, and the same updates."""
+    views, lights = upper(rng, 5), upper(rng, 4)
+    grid = factoring.map_operators(views, lights, 8, True)
+    listed = factoring.pair_map_operators(np.repeat(views, 4, 0), np.tile(lights, (5, 1)), 8, True)
+    factors = {name: rng.random((2, 64, 3)).astype(np.float32) for name in "pqrd"}
+    data = rng.random((5, 4, 3)).astype(np.float32)
+    expected = factoring.refine([factoring.Samples(data, grid)], factors, 2, 0.75)
+    found = factoring.refine([factoring.Samples(data.reshape(20, 3), listed)], factors, 2, 0.75)
+    for name in factors:
+        np.testing.assert_allclose(found[name], expected[name], rtol=tolerance("factored.svd.rtol"))
+
+
+@pytest.mark.parametrize("four", [False, True])
+def test_more_sweeps_raise_nothing_between_the_samples(rng, four):
+    """Five azimuths see no view's mirror image; a highlight on the table makes what no sample holds matter."""
+    btf = oracle_btf((3, 3), "10x5", "10x5")
+    h = halfway.half_vector(btf.lights.vectors[None], btf.views.vectors[:, None])
+    shine = (1 + 20 * h[..., 2] ** 200)[:, :, None, None, None] * btf.lights.vectors[:, 2, None, None, None]
+    btf = dataclasses.replace(btf, values=(shine * (0.1 + rng.random((3, 3, 3)))).astype(np.float32))
+    w_light, w_view, uv = upper(rng, 3000), upper(rng, 3000), rng.random((3000, 2))
+    peaks = {}
+    for sweeps in (8, 60):
+        for between in (0.0, 0.3):
+            rep = cmf.fit(btf, sweeps=sweeps, between=between, difference=four, clusters=None)
+            peaks[sweeps, between] = rep.evaluate(uv, w_light, w_view).max() / btf.values.max()
+    limit = tolerance("factored.between.max_peak")
+    assert max(peaks[8, 0.3], peaks[60, 0.3]) <= limit
+    assert peaks[60, 0.0] > limit
 
 
 @pytest.mark.parametrize("key", KEYS)
