@@ -35,7 +35,10 @@ def test_ports_agree_in_the_cap(evaluator, rng, tmp_path, spec, port):
     save(representation, tmp_path / "rough.raw.exr")
     n = 4000
     uv = rng.random((n, 2)).astype(np.float32)
-    for w_light, w_view in ((inside(rng, spec, n), hemisphere(rng, n)), (hemisphere(rng, n), inside(rng, spec, n))):
+    for w_light, w_view in (
+        (inside(rng, spec, n), hemisphere(rng, n)),
+        (hemisphere(rng, n), inside(rng, spec, n)),
+    ):
         value = evaluator(port, representation, tmp_path / "rough.raw.exr").evaluate(uv, w_light, w_view)
         for result in port_agreement(value, representation, (uv, w_light, w_view)).gates:
             assert result.passed, result.line

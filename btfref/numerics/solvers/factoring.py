@@ -268,10 +268,14 @@ def map_operators(views: np.ndarray, lights: np.ndarray, n: int, with_difference
     FactorOperators
     """
     h, d = half_difference(lights[None], views[:, None])
-    return FactorOperators(**_map_reading(lights, h.reshape(-1, 3), views, d.reshape(-1, 3), n, with_difference))
+    return FactorOperators(
+        **_map_reading(lights, h.reshape(-1, 3), views, d.reshape(-1, 3), n, with_difference)
+    )
 
 
-def pair_map_operators(w_view: np.ndarray, w_light: np.ndarray, n: int, with_difference: bool) -> PairOperators:
+def pair_map_operators(
+    w_view: np.ndarray, w_light: np.ndarray, n: int, with_difference: bool
+) -> PairOperators:
     """How n × n parabolic maps are read at listed pairs of directions, shapes (pair, 3)."""
     h, d = half_difference(w_light, w_view)
     return PairOperators(**_map_reading(w_light, h, w_view, d, n, with_difference))

@@ -366,9 +366,7 @@ def factorize(
         samples = [Samples(data, resampling.through_maps)]
         if between > 0:
             interpolated = resampling.to_between @ data.reshape(-1, data.shape[-1])
-            samples.append(
-                Samples(interpolated, resampling.between, between * data.size / interpolated.size)
-            )
+            samples.append(Samples(interpolated, resampling.between, between * data.size / interpolated.size))
         factors = refine(samples, factors, sweeps, exponent)
         models["maps"] = resampling.through_maps.product(factors)
         maps = {

@@ -149,20 +149,15 @@ def test_listed_pairs_are_read_as_the_grid_is(rng):
 
 @pytest.mark.parametrize("four", [False, True])
 def test_more_sweeps_raise_nothing_between_the_samples(rng, four):
-    """Five azimuths see no view's mirror image; a highlight on the table makes what no sample holds matter."""
-    btf = oracle_btf((3, 3), "10x5", "10x5")
-    h = halfway.half_vector(btf.lights.vectors[None], btf.views.vectors[:, None])
-    shine = (1 + 20 * h[..., 2] ** 200)[:, :, None, None, None] * btf.lights.vectors[:, 2, None, None, None]
-    btf = dataclasses.replace(btf, values=(shine * (0.1 + rng.random((3, 3, 3)))).astype(np.float32))
-    w_light, w_view, uv = upper(rng, 3000), upper(rng, 3000), rng.random((3000, 2))
-    peaks = {}
-    for sweeps in (8, 60):
-        for between in (0.0, 0.3):
-            rep = cmf.fit(btf, sweeps=sweeps, between=between, difference=four, clusters=None)
-            peaks[sweeps, between] = rep.evaluate(uv, w_light, w_view).max() / btf.values.max()
+    """Five azimuths see no view's mirror image; rough tables, which no product follows, try all that no sample holds."""
+    btf = oracle_btf((2, 2), "10x5", "10x5")
+    btf = dataclasses.replace(btf, values=np.exp(2 * rng.normal(size=btf.values.shape)).astype(np.float32))
+    w_light, w_view, uv = upper(rng, 4000), upper(rng, 4000), rng.random((4000, 2))
     limit = tolerance("factored.between.max_peak")
-    assert max(peaks[8, 0.3], peaks[60, 0.3]) <= limit
-    assert peaks[60, 0.0] > limit
+    for sweeps, between in ((8, 0.3), (60, 0.3), (60, 0.0)):
+        fitted = cmf.fit(btf, sweeps=sweeps, between=between, difference=four, clusters=None)
+        held = fitted.evaluate(uv, w_light, w_view).max() <= limit * btf.values.max()
+        assert held == (between > 0)
 
 
 @pytest.mark.parametrize("key", KEYS)
