@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from btfref.registry import Method
     from btfref.representations.protocol import Representation
     from btfref.sampling.sampled_btf import SampledBTF
-    from btfref.types import Facts, Progress
+    from btfref.types import Progress
 
 #: The gate that judges these figures.
 GATE = "fit.between_samples"
@@ -31,8 +31,8 @@ GATE = "fit.between_samples"
 #: Random lookups: 16 of them lie above the 99.9th percentile.
 LOOKUPS = 1 << 14
 
-#: Random texels and views whose directional albedo is measured, and the rule over the lights: 13 degrees between nodes at
-#: right angles to the polar angle, which a lobe of cos¹⁰⁰ fills.
+#: Random texels and views whose directional albedo is measured, and the rule over the lights: 13 degrees between nodes
+#: of one polar angle, which a lobe of cos¹⁰⁰ fills.
 ALBEDOS, ALBEDO_RULE = 128, (8, 28)
 
 
@@ -143,7 +143,7 @@ def interpolated(btf: SampledBTF, texel: np.ndarray, w_light: np.ndarray, w_view
     ndarray of float64, shape (n, 3)
     """
     values = btf.values.reshape(*btf.values.shape[:2], -1, 3)
-    result = np.empty((len(texel), 3))
+    result = np.zeros((len(texel), 3))
     for start in range(0, len(texel), CHUNK):
         part = slice(start, start + CHUNK)
         view, view_weight = btf.views.stencil(w_view[part])
