@@ -13,7 +13,7 @@ import numpy as np
 
 from btfref.gates.tolerances import gate_keys, gate_table, limits
 from btfref.gates.verdicts import GateResult, judge
-from btfref.numerics.solvers.threads import one_blas_thread
+from btfref.numerics.solvers.threads import reproducible
 from btfref.numerics.sphere.quadrature import gauss_hemisphere
 from btfref.representations.lookup import CHUNK
 
@@ -53,7 +53,8 @@ def fit(
     Representation
         ``meta["fit"]["between_samples"]`` holds what :func:`measure` finds; all else is as the method made it.
     """
-    made = method.fit(btf, seed=seed, progress=progress, **parameters)
+    with reproducible():
+        made = method.fit(btf, seed=seed, progress=progress, **parameters)
     facts = dict(made.meta.get("fit", {})) | {"between_samples": measure(made, btf)}
     return method.representation.from_arrays(made.arrays(), {**made.meta, "fit": facts})
 
@@ -79,7 +80,7 @@ def measure(representation: Representation, btf: SampledBTF, *, seed: int = 0) -
         negative values. NaN where data without light leave no quotient.
     """
     rng = np.random.default_rng(seed)
-    with one_blas_thread():
+    with reproducible():
         uv, texel = _texels(rng, LOOKUPS, btf)
         w_light, w_view = _uniform(rng, LOOKUPS), _uniform(rng, LOOKUPS)
         found = representation.evaluate(uv, w_light, w_view)

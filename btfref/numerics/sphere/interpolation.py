@@ -2,9 +2,10 @@
 
 Two kinds of sets, one contract: ``stencil(w)`` returns indices and non-negative weights that sum to 1, are
 continuous in ``w`` and exact at the samples. On ring grids the two neighbouring rings are blended, linear in φ
-on each and linear in θ between them; inside a first ring that is no pole, its two sides (:func:`across_the_cap`). Any
-other set is triangulated (spherical Delaunay) and blended with barycentric weights. What the ports need is in :meth:`arrays`, in float32; :func:`from_arrays` rebuilds the
-interpolation from those same arrays, so that the float64 definition sees exactly what the ports see.
+on each and linear in θ between them; inside a first ring that is no pole, its two sides (:func:`across_the_cap`).
+Any other set is triangulated (spherical Delaunay) and blended with barycentric weights. What the ports need is in
+:meth:`arrays`, in float32; :func:`from_arrays` rebuilds the interpolation from those same arrays, so that the float64
+definition sees exactly what the ports see.
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from btfref.numerics.solvers.threads import reproducible
 from btfref.representations.analytic import lafortune, light_functions
 from btfref.representations.lookup import positive_integer
 
@@ -60,6 +61,7 @@ class Representation(light_functions.AnalyticMaps):
         return factor[..., None].astype(np.float32) * lafortune.luminance_tables(self.maps, texels, views)
 
 
+@reproducible()
 def fit(
     btf: SampledBTF,
     *,

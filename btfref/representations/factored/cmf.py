@@ -6,9 +6,9 @@ the leading terms of the half/difference matrix (four factors). Then the data di
 measured parameterization; the leading terms of that residue are the factors of light and view.
 
 Differs from the paper: the product is refined as a whole, at the samples and at pairs of directions between them, where
-the data are interpolated. Half vectors of measured pairs leave gaps (with 5 azimuths, no view sees the mirror image of a
-light), and in a gap nothing else holds a factor: refined at the samples alone, products of coarse grids reach a hundred
-times the data's maximum there.
+the data are interpolated. Half vectors of measured pairs leave gaps (with 5 azimuths, no view sees the mirror image of
+a light), and in a gap nothing else holds a factor: refined at the samples alone, products of coarse grids reach a
+hundred times the data's maximum there.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from btfref.numerics.solvers.factoring import (
     refine,
     sparse_operator,
 )
+from btfref.numerics.solvers.threads import reproducible
 from btfref.numerics.sphere.directions import DirectionSet, ring_directions
 from btfref.numerics.sphere.halfway import half_difference, in_out
 from btfref.numerics.sphere.parabolic import texel_directions
@@ -231,6 +232,7 @@ def chain(data: np.ndarray, resampling: Resampling, terms: int, floor: float) ->
     return factors
 
 
+@reproducible()
 def fit(
     btf: SampledBTF,
     *,
