@@ -76,8 +76,9 @@ def measure(representation: Representation, btf: SampledBTF, *, seed: int = 0) -
         ``peak`` and ``peak_p999``: largest value and 99.9th percentile of |B|, over the data's largest value;
         ``mean_ratio``: mean of B over that of the data's interpolation; ``rms_to_raw``: RMS difference to that
         interpolation over its RMS; ``albedo``: the largest directional albedo, ∫ B over the lights, of a texel, view
-        and channel, and ``raw_albedo``, that of the interpolation at the same places; ``negative_fraction``: share of
-        negative values. NaN where data without light leave no quotient.
+        and channel, ``raw_albedo``, that of the interpolation at the same places, which coarse grids take above 1 by
+        themselves, and ``albedo_excess``, the one over the other or over 1, whichever is more;
+        ``negative_fraction``: share of negative values. NaN where data without light leave no quotient.
     """
     rng = np.random.default_rng(seed)
     with reproducible():
@@ -105,6 +106,7 @@ def measure(representation: Representation, btf: SampledBTF, *, seed: int = 0) -
         "rms_to_raw": _over(np.sqrt(np.mean((found - raw) ** 2)), np.sqrt(np.mean(raw**2))),
         "albedo": float(albedo.max()),
         "raw_albedo": float(raw_albedo.max()),
+        "albedo_excess": float(albedo.max() / max(raw_albedo.max(), 1.0)),
         "negative_fraction": float(np.mean(found < 0)),
     }
 

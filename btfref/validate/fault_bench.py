@@ -48,6 +48,11 @@ CHI2_SAMPLES = 200_000
 Gates = Sequence[GateResult]
 
 
+def _rough(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Values with a texture over directions that no product follows."""
+    return values * np.exp(rng.normal(size=values.shape))
+
+
 class Altered:
     """A plugin whose sampling is wrong in one way: ``density``, ``weight`` or ``pdf``."""
 
@@ -174,6 +179,16 @@ class Bench:
         image = 1.05 * expected if change == "bright" else expected
         variance = np.full(expected.shape, sigma**2)
         return compare(image, reference, classes=classes, gate=NOISY, variance=variance, flip=False).gates
+
+    def between(self, subject: Subject, change: str = "") -> Gates:
+        """A fit between its samples; the fault is one that is free there, on a grid of few azimuths."""
+        from btfref.registry import method as row
+        from btfref.representations import between
+
+        key, parameters = subject
+        rough = bumpy(shape=(2, 2), views="10x5", lights="10x5", change=_rough)
+        free: Facts = {"between": 0.0, "sweeps": 60} if change else {}
+        return between.gates(key, between.measure(row(key).fit(rough, **dict(parameters), **free), rough))
 
     def probes(self, subject: Subject) -> Gates:
         """The shader against the definition, at all levels of detail where there are any."""

@@ -171,5 +171,12 @@ FAULTS = (
     Fault("density of another view", "chi2.rejected.tests", "sampling", change="density"),
     Fault("weight that is not value over density", "sample.weight.max", "sampling", change="weight"),
     Fault("density that pdf() does not give", "sample.pdf.max", "sampling", change="pdf"),
+    Fault(
+        "factors free between the samples",
+        "fit.between_samples.peak",
+        "between",
+        "cmf",
+        change="free",
+    ),
     Fault("batches that share their random numbers", "waterfall.closure.z", "batches", change="shared"),
 )

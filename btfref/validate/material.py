@@ -88,11 +88,11 @@ def make_fit(cache: Cache, mesostructure: str, method: str, settings: Settings) 
     pathlib.Path
     """
     from btfref.registry import method as row
-    from btfref.representations import save
+    from btfref.representations import between, save
 
     key, suffix = fit_key(mesostructure, method, settings), f".{method}.exr"
     if cache.has(key, suffix):
         return cache.path(key, suffix)
     btf = load_material(make_material(cache, mesostructure, settings)[0])
-    made = row(method).fit(btf, seed=settings.seed)
+    made = between.fit(row(method), btf, seed=settings.seed)
     return cache.write(key, suffix, lambda path: save(made, path))

@@ -19,7 +19,14 @@ if TYPE_CHECKING:
     from btfref.types import JitArray, PathLike
 
 #: Gates of a method on its own.
-GATES = ("probe.agreement", "probe.finite", "chi2.rejected", "sample.weight", "sample.pdf")
+GATES = (
+    "probe.agreement",
+    "probe.finite",
+    "chi2.rejected",
+    "sample.weight",
+    "sample.pdf",
+    "fit.between_samples",
+)
 
 #: Lookups of each evaluator.
 PROBES = 8000

@@ -261,6 +261,7 @@ def _method_job(root: PathLike, specs: Sequence[Spec], settings: Settings) -> tu
 def _checks(cache: Cache, spec: Spec, file: PathLike, settings: Settings) -> Facts:
     """Agreement of the evaluators, sampling, and held-out directions of a method; cached."""
     from btfref.registry import method
+    from btfref.representations import between
     from btfref.representations.file.container import read_info
     from btfref.validate.method_gates import probe_gates, sampling_gates
 
@@ -275,11 +276,15 @@ def _checks(cache: Cache, spec: Spec, file: PathLike, settings: Settings) -> Fac
     if cache.has(key, ".checks.json"):
         return json.loads(cache.path(key, ".checks.json").read_text("utf-8"))
     start = time.perf_counter()
-    gates = [*probe_gates(file), *sampling_gates(file, samples=settings.chi2_samples)]
+    info = read_info(file)
+    gates = [
+        *probe_gates(file),
+        *sampling_gates(file, samples=settings.chi2_samples),
+        *between.gates(spec.method, info["fit"]["between_samples"]),
+    ]
     btf = load_material(make_material(cache, spec.mesostructure, settings)[0])
     fit = method(spec.method).fit
     error = held_out_error(fit, btf, texels=settings.held_out_texels)
-    info = read_info(file)
     checks = json_safe(
         {
             "gates": [gate.to_dict() for gate in gates],

@@ -89,28 +89,29 @@ class FactorOperators:
         """The approximation of the tables, shape (view, light, m)."""
         return self.in_out(factors) * self.half(factors)
 
-    def gathered(self, name: str, values: np.ndarray, factors: Factors) -> np.ndarray:
+    def gathered(self, name: str, tables: Sequence[np.ndarray], factors: Factors) -> list[np.ndarray]:
         """Transpose of how ``name``'s terms are read: values of pairs times the term's partner, summed per sample.
 
         Parameters
         ----------
         name : str
-        values : ndarray like the tables
+        tables : sequence of ndarray like the tables
         factors : dict of str to ndarray
 
         Returns
         -------
-        ndarray, shape (term, n, m)
+        list of ndarray, shape (term, n, m)
+            One for each of the tables.
         """
-        operator = getattr(self, name).T
+        operator, other = getattr(self, name).T, {"p": "r", "r": "p", "q": "d", "d": "q"}[name]
         if name in "pr":
-            partner = self.read("r" if name == "p" else "p", factors["r" if name == "p" else "p"])
-            return np.stack([operator @ self._over_partner(name, values, term) for term in partner])
-        values = values.reshape(-1, values.shape[-1])
+            partner = self.read(other, factors[other])
+            return [np.stack([operator @ self._over_partner(name, t, p) for p in partner]) for t in tables]
+        flat = [t.reshape(-1, t.shape[-1]) for t in tables]
         if self.d is None:
-            return (operator @ values)[None]
-        partner = self.read("d" if name == "q" else "q", factors["d" if name == "q" else "q"])
-        return np.stack([operator @ (values * term) for term in partner])
+            return [(operator @ t)[None] for t in flat]
+        partner = self.read(other, factors[other])
+        return [np.stack([operator @ (t * p) for p in partner]) for t in flat]
 
     def _over_partner(self, name: str, values: np.ndarray, term: np.ndarray) -> np.ndarray:
         """Sum over views of values times R for P, over lights of values times P for R."""
@@ -238,19 +239,26 @@ def refine(
     dict like ``factors``
     """
     factors = dict(factors)
+    # Read again only when one of their factors has changed.
+    in_out = [s.operators.in_out(factors) for s in samples]
+    half = [s.operators.half(factors) for s in samples]
     for _ in range(sweeps):
         weights = [
-            sample_weights(s.operators.product(factors), exponent) * np.float32(s.share) for s in samples
+            sample_weights(a * b, exponent) * np.float32(s.share)
+            for s, a, b in zip(samples, in_out, half, strict=True)
         ]
         for name in [name for name in "prqd" if name in factors]:
             numerator: Any = 0
             denominator: Any = 0
-            for s, weight in zip(samples, weights, strict=True):
-                in_out, half = s.operators.in_out(factors), s.operators.half(factors)
-                other = weight * (half if name in "pr" else in_out)
-                numerator = numerator + s.operators.gathered(name, other * s.data, factors)
-                denominator = denominator + s.operators.gathered(name, other * in_out * half, factors)
+            for s, weight, a, b in zip(samples, weights, in_out, half, strict=True):
+                other = weight * (b if name in "pr" else a)
+                above, below = s.operators.gathered(name, (other * s.data, other * a * b), factors)
+                numerator, denominator = numerator + above, denominator + below
             factors[name] = factors[name] * (numerator / np.maximum(denominator, TINY))
+            if name in "pr":
+                in_out = [s.operators.in_out(factors) for s in samples]
+            else:
+                half = [s.operators.half(factors) for s in samples]
     return factors
 
 
