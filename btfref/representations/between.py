@@ -7,7 +7,7 @@ highlights and is no truth itself; ``btfref bench between`` measures both agains
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -19,6 +19,8 @@ from btfref.representations.lookup import CHUNK
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from numpy.typing import ArrayLike
 
     from btfref.registry import Method
     from btfref.representations.protocol import Representation
@@ -59,12 +61,20 @@ def fit(
     return method.representation.from_arrays(made.arrays(), {**made.meta, "fit": facts})
 
 
-def measure(representation: Representation, btf: SampledBTF, *, seed: int = 0) -> dict[str, float]:
+class Evaluates(Protocol):
+    """What is measured: anything with the ``evaluate`` of a representation."""
+
+    def evaluate(self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike) -> np.ndarray:
+        """See :meth:`btfref.representations.protocol.Representation.evaluate`."""
+
+
+def measure(representation: Evaluates, btf: SampledBTF, *, seed: int = 0) -> dict[str, float]:
     """Figures of a representation at random directions, uniform on the hemisphere, and at random texels.
 
     Parameters
     ----------
     representation : Representation
+        Or anything with its ``evaluate``.
     btf : SampledBTF
         What it was fitted to.
     seed : int
