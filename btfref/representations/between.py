@@ -84,9 +84,9 @@ def measure(representation: Evaluates, btf: SampledBTF, *, seed: int = 0) -> dic
     -------
     dict of str to float
         ``peak`` and ``peak_p999``: largest value and 99.9th percentile of |B|, over the data's largest value;
-        ``mean_ratio``: mean of B over that of the data's interpolation; ``rms_to_raw``: RMS difference to that
+        ``mean_ratio``: mean of B over that of the data's interpolation; ``rms_to_data``: RMS difference to that
         interpolation over its RMS; ``albedo``: the largest directional albedo, ∫ B over the lights, of a texel, view
-        and channel, ``raw_albedo``, that of the interpolation at the same places, which coarse grids take above 1 by
+        and channel, ``data_albedo``, that of the interpolation at the same places, which coarse grids take above 1 by
         themselves, and ``albedo_excess``, the one over the other or over 1, whichever is more;
         ``negative_fraction``: share of negative values. NaN where data without light leave no quotient.
     """
@@ -101,7 +101,7 @@ def measure(representation: Evaluates, btf: SampledBTF, *, seed: int = 0) -> dic
         lights, weight = gauss_hemisphere(*ALBEDO_RULE)
         w_light = _turned(lights, 2 * np.pi * rng.random(ALBEDOS))
         albedo = weight @ representation.evaluate(uv[:, None], w_light, w_view[:, None])
-        raw_albedo = weight @ interpolated(
+        data_albedo = weight @ interpolated(
             btf,
             np.repeat(texel, len(lights)),
             w_light.reshape(-1, 3),
@@ -113,10 +113,10 @@ def measure(representation: Evaluates, btf: SampledBTF, *, seed: int = 0) -> dic
         "peak": _over(size.max(), largest),
         "peak_p999": _over(np.quantile(size, 0.999), largest),
         "mean_ratio": _over(found.mean(), raw.mean()),
-        "rms_to_raw": _over(np.sqrt(np.mean((found - raw) ** 2)), np.sqrt(np.mean(raw**2))),
+        "rms_to_data": _over(np.sqrt(np.mean((found - raw) ** 2)), np.sqrt(np.mean(raw**2))),
         "albedo": float(albedo.max()),
-        "raw_albedo": float(raw_albedo.max()),
-        "albedo_excess": float(albedo.max() / max(raw_albedo.max(), 1.0)),
+        "data_albedo": float(data_albedo.max()),
+        "albedo_excess": float(albedo.max() / max(data_albedo.max(), 1.0)),
         "negative_fraction": float(np.mean(found < 0)),
     }
 

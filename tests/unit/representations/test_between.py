@@ -39,10 +39,10 @@ def test_the_interpolation_differs_from_itself_by_nothing():
         btf = oracle_btf((3, 2), views, lights)
         facts = between.measure(methods()["raw"].fit(btf), btf)
         # Tables of directions are stored as float32.
-        assert facts["rms_to_raw"] <= tolerance("interpolation.float32.max")
+        assert facts["rms_to_data"] <= tolerance("interpolation.float32.max")
         assert abs(facts["mean_ratio"] - 1) <= tolerance("interpolation.float32.max")
         assert 0 < facts["peak_p999"] < facts["peak"] <= 1 + EXACT
-        assert facts["albedo_excess"] == facts["albedo"] / max(facts["raw_albedo"], 1)
+        assert facts["albedo_excess"] == facts["albedo"] / max(facts["data_albedo"], 1)
         assert facts["negative_fraction"] == 0
         assert all(gate.passed for gate in between.gates("raw", facts))
 
@@ -52,7 +52,7 @@ def test_a_wall_has_its_albedo():
     btf = lambert(0.7)
     facts = between.measure(methods()["raw"].fit(btf), btf)
     assert abs(facts["albedo"] / 0.7 - 1) <= tolerance("between.albedo.relative")
-    assert abs(facts["albedo"] - facts["raw_albedo"]) <= tolerance("interpolation.float32.max")
+    assert abs(facts["albedo"] - facts["data_albedo"]) <= tolerance("interpolation.float32.max")
 
 
 @pytest.mark.parametrize(
