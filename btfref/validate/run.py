@@ -280,7 +280,7 @@ def _checks(cache: Cache, spec: Spec, file: PathLike, settings: Settings) -> Fac
     gates = [
         *probe_gates(file),
         *sampling_gates(file, samples=settings.chi2_samples),
-        *between.gates(spec.method, info["fit"]["between_samples"]),
+        *between.gates(spec.method, info["fit"].get("between_samples", {})),
     ]
     btf = load_material(make_material(cache, spec.mesostructure, settings)[0])
     fit = method(spec.method).fit

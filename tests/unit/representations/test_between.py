@@ -9,8 +9,10 @@ from oracle import oracle_btf, scattered
 
 from btfref.cli import main
 from btfref.gates.tolerances import tolerance
+from btfref.numerics.sphere.quadrature import gauss_hemisphere
 from btfref.registry import methods
 from btfref.representations import between, load
+from btfref.representations.analytic import lafortune, lafortune_lut
 from btfref.sampling import SampledBTF
 
 EXACT = tolerance("interpolation.exact.max")
@@ -106,3 +108,25 @@ def test_commands_state_it_and_warn_in_one_line(tmp_path, capsys, rng):
     printed = capsys.readouterr()
     assert "between the samples: peak " in printed.out
     assert printed.err == ""
+
+
+def test_the_factor_of_lafortune_lut_makes_no_light():
+    """A mirror's lobe, which no light of 5 azimuths meets: least squares at the lights leave its brightness open."""
+    btf = oracle_btf((1, 1), "10x5", "10x5")
+    parameters = np.array([[0.01, -1, -1, 1, np.log(60), 5.0]], np.float32)
+    lobes, peaks, diffuse = lafortune.lobe_maps(parameters)
+    maps = {"lobes": lobes, "peaks": peaks, "colour": np.pad(diffuse[:, None], ((0, 0), (3, 0)))}
+    maps |= {"view_directions": btf.views.vectors, "light_directions": btf.lights.vectors}
+    views, texels = np.arange(len(btf.views)), np.array([0])
+    luminance = 6 * np.moveaxis(lafortune.luminance_tables(maps, texels, views), 0, 2)
+    lights, weight = gauss_hemisphere(24, 96)
+    albedo = lafortune.luminance_tables(maps | {"light_directions": lights}, texels, views)[0] @ weight
+    most = np.maximum(1, np.einsum("l,vln->v", btf.lights.quadrature_weights, luminance))
+    free, bounded = (
+        lafortune_lut.view_factor(luminance, parameters, btf, bounded=bound)[:, 0] for bound in (False, True)
+    )
+    limit = most * (1 + tolerance("between.bounded.relative"))
+    assert (free * albedo > limit).any()
+    assert (bounded * albedo <= limit).all()
+    within = free * albedo <= most / (1 + tolerance("between.bounded.relative"))
+    np.testing.assert_array_equal(bounded[within], free[within])
