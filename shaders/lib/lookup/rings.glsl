@@ -33,14 +33,14 @@ void ring_neighbours(vec4 ring, Angle azimuth, float share, out ivec2 index, out
 // polygon; a chord of it is blended linearly between the two edges that it meets. See across_the_cap in
 // btfref/numerics/sphere/interpolation.py.
 Stencil cap_stencil(vec4 ring, Angle azimuth, float radius) {
-    float count = ring.z, step = 6.28318530717958648 / count, first, fraction;
+    float count = ring.z, turn = 6.28318530717958648 / count, first, fraction;
     ring_position(ring, azimuth, first, fraction);
-    float a = step * first, b = step * (first + 1.0);
+    float a = turn * first, b = turn * (first + 1.0);
     vec2 place = radius * mix(vec2(cos(a), sin(a)), vec2(cos(b), sin(b)), fraction);
-    float corner = clamp(floor(acos(clamp(place.x, -1.0, 1.0)) / step), 0.0, max(floor(0.5 * count) - 1.0, 0.0));
-    float start = cos(step * corner), end = cos(step * (corner + 1.0));
+    float corner = clamp(floor(acos(clamp(place.x, -1.0, 1.0)) / turn), 0.0, max(floor(0.5 * count) - 1.0, 0.0));
+    float start = cos(turn * corner), end = cos(turn * (corner + 1.0));
     float along = start > end ? clamp((start - place.x) / (start - end), 0.0, 1.0) : 0.0;
-    float height = mix(sin(step * corner), sin(step * (corner + 1.0)), along);
+    float height = mix(sin(turn * corner), sin(turn * (corner + 1.0)), along);
     // 1e-30: at a corner on the axis the chord is a point, and any share of it will do.
     float below = clamp(0.5 - 0.5 * place.y / max(height, 1e-30), 0.0, 1.0);
     // Opposite sample numbers: the chord's lower end lies as far after sample 0 as its upper end lies before it.
