@@ -1,5 +1,4 @@
-// Provides ring_stencil: neighbours of a direction among samples on rings, linear in azimuth and in polar angle, also
-// inside a first ring that is no pole.
+// Provides ring_stencil: neighbours of a direction among samples on rings and inside the first, where that is no pole.
 // Expects a table with one texel a ring: polar angle, azimuth of the first sample, samples, index of the first.
 
 #include "lib/lookup/angles.glsl"
