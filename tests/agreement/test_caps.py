@@ -14,7 +14,7 @@ from btfref.stress.evaluators import PORTS
 from btfref.stress.judging import port_agreement
 
 #: Odd and even numbers of azimuths, few and many; a wide cap.
-SETS = ("10x5", "16x8", "1x4", "2x24")
+SETS = ("10x5", "16x8", "1x4", "2x60")
 
 
 def inside(rng, spec, n):

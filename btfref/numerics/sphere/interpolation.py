@@ -81,7 +81,8 @@ class RingInterpolation:
             weights += [share * (1 - fraction), share * fraction]
             if ring is low and table[0, 0] > 0:
                 cap = theta < table[0, 0]
-                inner = across_the_cap(first[cap], fraction[cap], theta[cap] / table[0, 0], table[0, 2])
+                inset = (table[0, 0] - theta[cap]) / table[0, 0]
+                inner = across_the_cap(first[cap], fraction[cap], inset, table[0, 2])
         weight, index = np.stack(weights, -1), np.stack(indices, -1)
         if table[0, 0] > 0:
             index[cap], weight[cap] = inner[0] + table[0, 3], inner[1]
@@ -98,7 +99,7 @@ class RingInterpolation:
 
 
 def across_the_cap(
-    first: np.ndarray, fraction: np.ndarray, radius: np.ndarray, count: float
+    first: np.ndarray, fraction: np.ndarray, inset: np.ndarray, count: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Samples and weights inside the first ring of a set without a sample at the pole.
 
@@ -112,8 +113,8 @@ def across_the_cap(
     ----------
     first, fraction : ndarray, shape (n,)
         Sample at or before the azimuth, and the way from there to the next, [0, 1).
-    radius : ndarray, shape (n,)
-        θ / θ_first, [0, 1].
+    inset : ndarray, shape (n,)
+        1 − θ / θ_first, [0, 1].
     count : float
         Samples of the ring.
 
@@ -122,19 +123,28 @@ def across_the_cap(
     index : ndarray, shape (n, 4)
         On the ring, as floats.
     weight : ndarray, shape (n, 4)
-        Non-negative, sum 1; for a radius of 1 those of the ring.
+        Non-negative, sum 1; for an inset of 0 those of the ring.
     """
-    step = 2 * np.pi / count
+    step, radius = 2 * np.pi / count, 1 - inset
+    # The lower side is the mirror image of the upper one.
+    lower = first + fraction > count / 2
+    first, fraction = np.where(lower, count - 1 - first, first), np.where(lower, 1 - fraction, fraction)
     x = radius * ((1 - fraction) * np.cos(step * first) + fraction * np.cos(step * (first + 1)))
-    y = radius * ((1 - fraction) * np.sin(step * first) + fraction * np.sin(step * (first + 1)))
     # The corner at or before the chord on the upper side. Its mirror image is the corner after it on the lower side.
     corner = np.clip(np.floor(np.arccos(np.clip(x, -1, 1)) / step), 0, max(count // 2 - 1, 0))
-    start, end = np.cos(step * corner), np.cos(step * (corner + 1))
-    width = start - end
-    along = np.clip((start - x) / np.where(width > 0, width, 1), 0, 1)
+
+    def before(k: np.ndarray) -> np.ndarray:
+        """Cosine at the corner less that at corner k, as a product: near the axis, differences of cosines cancel."""
+        return 2 * np.sin(0.5 * step * (corner + k)) * np.sin(0.5 * step * (k - corner))
+
+    way = (1 - fraction) * before(first) + fraction * before(first + 1)
+    way, width = inset * np.cos(step * corner) + radius * way, before(corner + 1)
+    along = np.clip(way / np.where(width > 0, width, 1), 0, 1)
+    y = radius * ((1 - fraction) * np.sin(step * first) + fraction * np.sin(step * (first + 1)))
     height = (1 - along) * np.sin(step * corner) + along * np.sin(step * (corner + 1))
     # At a corner on the axis the chord is a point, and any share of it will do.
-    below = np.clip(0.5 - 0.5 * y / np.maximum(height, 1e-30), 0, 1)
+    far = np.clip(0.5 - 0.5 * y / np.maximum(height, 1e-30), 0, 1)
+    below = np.where(lower, 1 - far, far)
     mirrored = count - 1 - corner
     index = [corner, np.mod(corner + 1, count), mirrored, np.mod(mirrored + 1, count)]
     above = 1 - below
