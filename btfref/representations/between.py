@@ -7,6 +7,7 @@ highlights and is no truth itself; ``btfref bench between`` measures both agains
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -138,7 +139,9 @@ def gates(method: str, facts: Mapping[str, float]) -> list[GateResult]:
     own = f"{GATE}.{method}"
     key = own if own in gate_keys() else GATE
     names = {entry.removeprefix("min_") for entry in limits(gate_table(key))}
-    return judge(key, {name: facts[name] for name in facts.keys() & names})
+    found = judge(key, {name: facts[name] for name in facts.keys() & names})
+    # One name whoever's limits they are.
+    return [replace(gate, name=f"{GATE}.{gate.entry}") for gate in found]
 
 
 def interpolated(btf: SampledBTF, texel: np.ndarray, w_light: np.ndarray, w_view: np.ndarray) -> np.ndarray:
