@@ -92,7 +92,7 @@ def fit(
         Refits of the lobes after the first fit; the factor is updated after each. At least 1.
     bounded : bool
         The factor is at most what keeps the directional albedo of each measured view, of luminance, at 1, or at that of
-        the data where they have more: least squares at a few lights may not see how bright a lobe is between them.
+        the data where they have more: least squares at a few lights leave open how bright a lobe is between them.
         Differs from the paper (False).
     storage : {"half", "float"}
         Type of the stored maps.
