@@ -111,7 +111,7 @@ def fit(
     preset : str, optional
         Named settings, such as "paper"; `parameters` go before them.
     seed : int
-        Same seed, same bytes (on the same machine).
+        Same seed, same bytes (on the same machine), whatever the number of threads.
     progress : callable, optional
         Called as ``progress(done, total, label)``.
     **parameters
@@ -120,6 +120,8 @@ def fit(
     Returns
     -------
     Representation
+        ``meta["fit"]["between_samples"]`` says how wrong it is between the samples:
+        :func:`btfref.representations.between.measure`.
 
     Raises
     ------
@@ -127,9 +129,10 @@ def fit(
         For an unknown method, preset or parameter, or one that is out of range.
     """
     from btfref.registry import method as row
+    from btfref.representations import between
 
     found = row(method)
-    return found.fit(btf, seed=seed, progress=progress, **found.settings(preset, parameters))
+    return between.fit(found, btf, seed=seed, progress=progress, **found.settings(preset, parameters))
 
 
 def save(data: SampledBTF | Representation, path: PathLike) -> None:

@@ -25,11 +25,11 @@ def scattered(n=81, seed=3):
     return hemisphere(np.random.default_rng(seed), n, float)
 
 
-#: Sets of (views, lights): rings, rings with shifted azimuths, sets without a pole or rings of their own, no rings.
+#: Sets of (views, lights): rings, rings with shifted azimuths, rings without a pole, no rings.
 KINDS = {
     "ubo81": ("ubo81", "ubo81"),
     "shifted": ("ubo151", "ubo81"),
-    "triangles": ("10x5", "16x8"),
+    "capped": ("10x5", "16x8"),
     "scattered": (scattered(seed=3), scattered(seed=4)),
 }
 

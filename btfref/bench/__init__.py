@@ -8,6 +8,7 @@ from __future__ import annotations
 
 #: Suites by name.
 SUITES = {
+    "between": "btfref.bench.experiments.between",
     "demand": "btfref.bench.demand",
     "env": "btfref.bench.experiments.env",
     "factors": "btfref.bench.experiments.factors",

@@ -1,6 +1,7 @@
 """Compress a sampled BTF with one of the methods.
 
-`--preset paper` starts from the settings of the method's paper; --set overrides single parameters.
+`--preset paper` starts from the settings of the method's paper; --set overrides single parameters. The file and the
+output say how wrong the fit is between its samples, at random directions; beyond stated limits there is a warning.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 
 from btfref.commands.shared.options import add_json, add_overwrite, add_seed
-from btfref.commands.shared.printing import Progress, write_representation
+from btfref.commands.shared.printing import Progress, emit, number, write_representation
 from btfref.commands.shared.reading import assignments, output_file
 from btfref.errors import InputError
 
@@ -64,6 +65,7 @@ def run(args: Namespace) -> int:
         given["target_error"] = args.target_error
     parameters = row.settings(args.preset, given)
 
+    from btfref.representations import between
     from btfref.representations.protocol import FitsPartially
     from btfref.sampling import SampledBTF, open_store
 
@@ -75,6 +77,25 @@ def run(args: Namespace) -> int:
     else:
         btf = SampledBTF.load(args.btf)
         with Progress() as progress:
-            representation = row.fit(btf, seed=args.seed, progress=progress, **parameters)
+            representation = between.fit(row, btf, seed=args.seed, progress=progress, **parameters)
     write_representation(representation, out, json=args.json)
+    _say_between(row.key, representation.meta.get("fit", {}).get("between_samples"), json=args.json)
     return 0
+
+
+def _say_between(method: str, facts: dict[str, float] | None, *, json: bool) -> None:
+    """How wrong the fit is between its samples; on standard error, what is beyond the stated limits."""
+    import sys
+
+    from btfref.representations import between
+
+    if facts is None:  # fitted to a part
+        return
+    if not json:
+        emit("between the samples: " + ", ".join(f"{name} {number(facts[name])}" for name in facts))
+    beyond = [gate for gate in between.gates(method, facts) if not gate.passed]
+    if beyond:
+        found = ", ".join(
+            f"{g.entry.removeprefix('min_')} {number(g.value)}, wanted {g.sign} {g.limit:g}" for g in beyond
+        )
+        sys.stderr.write(f"btfref: warning: wrong between the samples: {found}\n")

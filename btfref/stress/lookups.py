@@ -266,8 +266,15 @@ _NOT_DIRECTIONS = np.array(
 )
 
 
+#: See `_on_edges`.
+PER_CAP = 4
+
+
 def _on_edges(rng: np.random.Generator, n: int, arrays: Mapping[str, np.ndarray], prefix: str) -> np.ndarray:
-    """Directions on borders between cells of the interpolation: edges of triangles, or azimuths of ring samples."""
+    """Directions on borders between cells of the interpolation: edges of triangles, or azimuths of ring samples.
+
+    Of rings without a pole, one in `PER_CAP` lies anywhere inside the first, where chords of all directions are cut.
+    """
     table = interpolation.whole(interpolation.from_arrays(arrays, prefix))
     if isinstance(table, interpolation.TriangleInterpolation):
         triangle = np.asarray(table.triangles, float)[rng.integers(0, len(table.triangles), n)]
@@ -276,6 +283,9 @@ def _on_edges(rng: np.random.Generator, n: int, arrays: Mapping[str, np.ndarray]
     ring = np.asarray(table.rings, float)[rng.integers(0, len(table.rings), n)]
     theta = rng.uniform(0, np.pi / 2 - 1e-6, n)
     phi = ring[:, 1] + rng.integers(0, 64, n) * 2 * np.pi / ring[:, 2]
+    if table.rings[0, 0] > 0:
+        theta[::PER_CAP] = rng.uniform(0, table.rings[0, 0], len(theta[::PER_CAP]))
+        phi[::PER_CAP] += rng.uniform(0, 2 * np.pi, len(theta[::PER_CAP]))
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
 
 

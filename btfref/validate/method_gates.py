@@ -20,7 +20,15 @@ if TYPE_CHECKING:
     from btfref.types import JitArray, PathLike
 
 #: Gates of a method on its own.
-GATES = ("probe.agreement", "probe.finite", "image.witness", "chi2.rejected", "sample.weight", "sample.pdf")
+GATES = (
+    "probe.agreement",
+    "probe.finite",
+    "image.witness",
+    "chi2.rejected",
+    "sample.weight",
+    "sample.pdf",
+    "fit.between_samples",
+)
 
 #: Lookups of each evaluator.
 PROBES = 8000

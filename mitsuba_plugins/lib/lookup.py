@@ -188,7 +188,57 @@ class RingTable:
                     share * fraction,
                 )
             )
+            if ring is low and self.rings[0, 0] > 0:
+                # In the cap, ``beyond`` and the rest of the angle are θ − θ_first.
+                inset = (beyond + polar[1]) * float(-1 / self.rings[0, 0])
+                cap = self._across_the_cap(first, fraction, inset)
+        if self.rings[0, 0] > 0:
+            inside = theta < float(self.rings[0, 0])
+            neighbours = [_chosen(inside, *pair) for pair in zip(cap, neighbours, strict=True)]
         return neighbours
+
+    def _across_the_cap(
+        self, first: JitArray, fraction: JitArray, inset: JitArray
+    ) -> tuple[Neighbour, Neighbour]:
+        """As :func:`btfref.numerics.sphere.interpolation.across_the_cap`."""
+        _, _, count, offset = (float(v) for v in self.rings[0])
+        step, radius = 2 * np.pi / count, 1 - inset
+        lower = first + fraction > 0.5 * count
+        first = dr.select(lower, count - 1 - first, first)
+        fraction = dr.select(lower, 1 - fraction, fraction)
+        (a_sin, a_cos), (b_sin, b_cos) = dr.sincos(step * first), dr.sincos(step * (first + 1))
+        x, y = radius * dr.lerp(a_cos, b_cos, fraction), radius * dr.lerp(a_sin, b_sin, fraction)
+        corner = dr.floor(dr.acos(dr.clip(x, -1, 1)) * float(1 / step))
+        corner = dr.clip(corner, 0, max(count // 2 - 1, 0))
+
+        def before(k: JitArray) -> JitArray:
+            return 2 * dr.sin(0.5 * step * (corner + k)) * dr.sin(0.5 * step * (k - corner))
+
+        start_sin, start_cos = dr.sincos(step * corner)
+        way = dr.fma(inset, start_cos, radius * dr.lerp(before(first), before(first + 1), fraction))
+        width = before(corner + 1)
+        along = dr.clip(way / dr.select(width > 0, width, 1), 0, 1)
+        height = dr.lerp(start_sin, dr.sin(step * (corner + 1)), along)
+        # At a corner on the axis the chord is a point, and any share of it will do.
+        far = dr.clip(0.5 - 0.5 * y / dr.maximum(height, 1e-30), 0, 1)
+        below = dr.select(lower, 1 - far, far)
+        above, mirrored = 1 - below, count - 1 - corner
+
+        def pair(sample: JitArray, weight: JitArray, following_weight: JitArray) -> Neighbour:
+            following = dr.select(sample + 1 < count, sample + 1, 0)
+            return Neighbour(
+                mi.UInt32(offset + sample), weight, mi.UInt32(offset + following), following_weight
+            )
+
+        return pair(corner, above * (1 - along), above * along), pair(
+            mirrored, below * along, below * (1 - along)
+        )
+
+
+def _chosen(mask: JitArray, one: Neighbour, other: Neighbour) -> Neighbour:
+    """One neighbour where a mask holds, else another."""
+    (a, b), (c, d) = one.single(), other.single()
+    return Neighbour(*(dr.select(mask, x, y) for x, y in zip((*a, *b), (*c, *d), strict=True)))
 
 
 class TriangleTable:

@@ -12,7 +12,7 @@ from btfref.rendering.gl.probe import probe
 from btfref.stress.judging import port_agreement
 
 #: Sets of directions: test_evaluators.py has the others.
-SETS = ("shifted", "triangles")
+SETS = ("shifted", "capped")
 
 N_POINTS = 10_000
 
@@ -28,7 +28,7 @@ def test_probe_agrees_with_the_definition(need, rng, fits, key, kind):
 
 
 @pytest.mark.parametrize("key", methods())
-@pytest.mark.parametrize("kind", ["ubo81", "triangles"])
+@pytest.mark.parametrize("kind", ["ubo81", "scattered"])
 def test_below_the_horizon_is_exactly_zero(need, fits, key, kind):
     need("gl")
     up, down, level = [0.6, 0, 0.8], [0.6, 0, -0.8], [1, 0, 0]
@@ -76,7 +76,7 @@ STAGES = [
 
 
 @pytest.mark.parametrize("target", composer.TARGETS)
-@pytest.mark.parametrize("kind", ["ubo81", "triangles"])
+@pytest.mark.parametrize("kind", ["ubo81", "scattered"])
 @pytest.mark.parametrize("key", methods())
 def test_glslang_accepts_every_representation_in_every_host(need, fits, tmp_path, key, kind, target):
     validator = need("glslang")

@@ -43,7 +43,7 @@ def lookups(rng, representation, kind, chosen, n=4000):
     return (uv[clear], w_light[clear], w_view[clear]), ~absent.any(1)[clear]
 
 
-@pytest.mark.parametrize("directions", ["ubo81", "triangles"])
+@pytest.mark.parametrize("directions", ["ubo81", "scattered"])
 @pytest.mark.parametrize(("key", "kind"), CASES)
 def test_kept_directions_give_the_same_numbers_and_others_none(
     need, fits, evaluator, rng, key, kind, directions

@@ -27,7 +27,7 @@ OWN = ("rf_lobes", "lafortune", "lafortune_lut", "gbrdf")
 #: Method, directions, and what samples: each method's default, the shared tables alone, and lobes alone.
 CASES = [
     *((key, "ubo81", "") for key in methods()),
-    ("lpca", "triangles", ""),
+    ("lpca", "capped", ""),
     *((key, "ubo81", "lobes") for key in OWN),
 ]
 

@@ -7,7 +7,7 @@ as the values of a BTF have their texels: tables are (view, light, m), factors (
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -89,6 +89,51 @@ class FactorOperators:
         """The approximation of the tables, shape (view, light, m)."""
         return self.in_out(factors) * self.half(factors)
 
+    def gathered(self, name: str, tables: Sequence[np.ndarray], factors: Factors) -> list[np.ndarray]:
+        """Transpose of how ``name``'s terms are read: values of pairs times the term's partner, summed per sample.
+
+        Parameters
+        ----------
+        name : str
+        tables : sequence of ndarray like the tables
+        factors : dict of str to ndarray
+
+        Returns
+        -------
+        list of ndarray, shape (term, n, m)
+            One for each of the tables.
+        """
+        operator, other = getattr(self, name).T, {"p": "r", "r": "p", "q": "d", "d": "q"}[name]
+        if name in "pr":
+            partner = self.read(other, factors[other])
+            return [np.stack([operator @ self._over_partner(name, t, p) for p in partner]) for t in tables]
+        flat = [t.reshape(-1, t.shape[-1]) for t in tables]
+        if self.d is None:
+            return [(operator @ t)[None] for t in flat]
+        partner = self.read(other, factors[other])
+        return [np.stack([operator @ (t * p) for p in partner]) for t in flat]
+
+    def _over_partner(self, name: str, values: np.ndarray, term: np.ndarray) -> np.ndarray:
+        """Sum over views of values times R for P, over lights of values times P for R."""
+        return np.einsum("vlm,vm->lm" if name == "p" else "vlm,lm->vm", values, term)
+
+
+@dataclass(frozen=True)
+class PairOperators(FactorOperators):
+    """The same for listed pairs of directions: all operators have a row a pair, tables are (pair, m)."""
+
+    def in_out(self, factors: Factors) -> np.ndarray:
+        """``Σ_k P_k(l) R_k(v)``, shape (pair, m)."""
+        return (self.read("p", factors["p"]) * self.read("r", factors["r"])).sum(0)
+
+    def half(self, factors: Factors) -> np.ndarray:
+        """``Σ_j Q_j(h) D_j(d)``, shape (pair, m)."""
+        q = self.read("q", factors["q"])
+        return (q if self.d is None else q * self.read("d", factors["d"])).sum(0)
+
+    def _over_partner(self, name: str, values: np.ndarray, term: np.ndarray) -> np.ndarray:
+        return values * term
+
 
 def rank_terms(data: np.ndarray, weight: np.ndarray | None, terms: int) -> tuple[np.ndarray, np.ndarray]:
     """Non-negative ``Σ_k left_k right_k`` that approximates ``data`` in the least-squares sense.
@@ -138,75 +183,82 @@ def rank_terms(data: np.ndarray, weight: np.ndarray | None, terms: int) -> tuple
     return left, right
 
 
-def sample_weights(data: np.ndarray, exponent: float) -> np.ndarray:
-    """Weights of samples' squared errors, ``(data + WEIGHT_FLOOR)^−exponent``.
+def sample_weights(values: np.ndarray, exponent: float) -> np.ndarray:
+    """Weights of samples' squared errors, ``(values + WEIGHT_FLOOR)^−exponent``.
 
     Parameters
     ----------
-    data : ndarray
-        Tables of mean 1.
+    values : ndarray
+        Of tables of mean 1, or what approximates them. Weights by the approximation keep the mean: where a single
+        sample's value decides its weight, the high ones count less than the low ones beside them, and the whole turns
+        out too dark.
     exponent : float
         0: absolute errors, ruled by highlights; 2: relative errors, ruled by shadows.
     """
-    return (data + np.float32(WEIGHT_FLOOR)) ** np.float32(-exponent)
+    if exponent == 0:
+        return np.ones_like(values)
+    return (values + np.float32(WEIGHT_FLOOR)) ** np.float32(-exponent)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Tables that factors are to approximate.
+
+    Attributes
+    ----------
+    data : ndarray, shape (view, light, m), or (pair, m) for listed pairs
+    operators : FactorOperators
+    share : float
+        What their squared errors count.
+    """
+
+    data: np.ndarray
+    operators: FactorOperators
+    share: float = 1.0
 
 
 def refine(
-    data: np.ndarray,
-    factors: Factors,
-    operators: FactorOperators,
-    sweeps: int,
-    weight: np.ndarray | float = 1,
+    samples: Sequence[Samples], factors: Factors, sweeps: int, exponent: float = 0.0
 ) -> dict[str, np.ndarray]:
     """Sweeps of multiplicative updates towards the least weighted squared error of the product itself.
 
     Lee and Seung 2001, with the other factors and the reading of the maps as known linear operators: each update keeps
-    factors non-negative and the error from growing.
+    factors non-negative, and the error, as it is weighted in that sweep, from growing.
 
     Parameters
     ----------
-    data : ndarray, shape (view, light, m)
+    samples : sequence of Samples
     factors : dict of str to ndarray
         "p", "q", "r" and perhaps "d", shape (term, n, m); not changed.
-    operators : FactorOperators
     sweeps : int
-    weight : ndarray like ``data``, or 1
+    exponent : float
+        Of the weights, :func:`sample_weights` of the product before each sweep.
 
     Returns
     -------
     dict like ``factors``
     """
     factors = dict(factors)
-
-    def update(name: str, numerator: Iterable[np.ndarray], denominator: Iterable[np.ndarray]) -> None:
-        operator = getattr(operators, name).T
-        factors[name] = factors[name] * np.stack(
-            [
-                (operator @ n) / np.maximum(operator @ d, TINY)
-                for n, d in zip(numerator, denominator, strict=True)
-            ]
-        )
-
-    data = weight * data
-    in_out = operators.in_out(factors)
+    # Read again only when one of their factors has changed.
+    in_out = [s.operators.in_out(factors) for s in samples]
+    half = [s.operators.half(factors) for s in samples]
     for _ in range(sweeps):
-        half = operators.half(factors)
-        x, y = data * half, weight * half * half
-        r = operators.read("r", factors["r"])
-        update("p", np.einsum("vlm,kvm->klm", x, r), np.einsum("vlm,kvm->klm", y * in_out, r))
-        in_out = operators.in_out(factors)
-        p = operators.read("p", factors["p"])
-        update("r", np.einsum("vlm,klm->kvm", x, p), np.einsum("vlm,klm->kvm", y * in_out, p))
-        in_out = operators.in_out(factors)
-        x, y = data * in_out, weight * in_out * in_out
-        names = "q" if operators.d is None else "qd"
-        for name, other in zip(names, names[::-1], strict=True):
-            a, b = x.reshape(-1, x.shape[-1]), (y * operators.half(factors)).reshape(-1, x.shape[-1])
-            if operators.d is None:
-                update(name, [a], [b])
+        weights = [
+            sample_weights(a * b, exponent) * np.float32(s.share)
+            for s, a, b in zip(samples, in_out, half, strict=True)
+        ]
+        for name in [name for name in "prqd" if name in factors]:
+            numerator: Any = 0
+            denominator: Any = 0
+            for s, weight, a, b in zip(samples, weights, in_out, half, strict=True):
+                other = weight * (b if name in "pr" else a)
+                above, below = s.operators.gathered(name, (other * s.data, other * a * b), factors)
+                numerator, denominator = numerator + above, denominator + below
+            factors[name] = factors[name] * (numerator / np.maximum(denominator, TINY))
+            if name in "pr":
+                in_out = [s.operators.in_out(factors) for s in samples]
             else:
-                values = operators.read(other, factors[other])
-                update(name, a * values, b * values)
+                half = [s.operators.half(factors) for s in samples]
     return factors
 
 
@@ -224,9 +276,21 @@ def map_operators(views: np.ndarray, lights: np.ndarray, n: int, with_difference
     FactorOperators
     """
     h, d = half_difference(lights[None], views[:, None])
-    directions = {"p": lights, "q": h.reshape(-1, 3), "r": views, "d": d.reshape(-1, 3)}
-    if not with_difference:
-        del directions["d"]
     return FactorOperators(
-        **{name: sparse_operator(*bilinear_stencil(w, n), n * n) for name, w in directions.items()}
+        **_map_reading(lights, h.reshape(-1, 3), views, d.reshape(-1, 3), n, with_difference)
     )
+
+
+def pair_map_operators(
+    w_view: np.ndarray, w_light: np.ndarray, n: int, with_difference: bool
+) -> PairOperators:
+    """How n × n parabolic maps are read at listed pairs of directions, shapes (pair, 3)."""
+    h, d = half_difference(w_light, w_view)
+    return PairOperators(**_map_reading(w_light, h, w_view, d, n, with_difference))
+
+
+def _map_reading(
+    p: np.ndarray, q: np.ndarray, r: np.ndarray, d: np.ndarray, n: int, with_difference: bool
+) -> dict[str, Any]:
+    directions = {"p": p, "q": q, "r": r} | ({"d": d} if with_difference else {})
+    return {name: sparse_operator(*bilinear_stencil(w, n), n * n) for name, w in directions.items()}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics.solvers.threads import one_blas_thread
+from btfref.numerics.solvers.threads import one_blas_thread, product
 
 
 def texel_matrix(values: np.ndarray) -> np.ndarray:
@@ -64,10 +64,10 @@ def range_basis(
     n, d = matrix.shape
     rank = min(rank, n, d)
     width = min(rank + 8, n, d)
-    sample = rng.standard_normal((width, n), dtype=np.float32) @ matrix
+    sample = product(rng.standard_normal((width, n), dtype=np.float32), matrix)
     for _ in range(iterations):
         # Orthonormalising on the short side between the products keeps float32 from losing small directions.
-        sample = _orthonormal(matrix @ _orthonormal(sample.T)).T @ matrix
+        sample = product(_orthonormal(product(matrix, _orthonormal(sample.T))).T, matrix)
     return _rotated(matrix, _orthonormal(sample.T), rank)
 
 
@@ -86,7 +86,7 @@ def refined_basis(matrix: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray, np
         As :func:`range_basis`, of rank at most ``min(rank, n)``; zero rows where ``matrix`` has a lower rank.
     """
     rank = min(len(basis), *matrix.shape)
-    sample = _orthonormal(matrix @ basis.T)[:, :rank].T @ matrix
+    sample = product(_orthonormal(product(matrix, basis.T))[:, :rank].T, matrix)
     basis, coordinates = _rotated(matrix, _orthonormal(sample.T), rank)
     energy = (coordinates.astype(float) ** 2).sum(0)
     # Relative to the largest, float32 products carry nothing below this.
@@ -96,12 +96,12 @@ def refined_basis(matrix: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray, np
 
 def _rotated(matrix: np.ndarray, columns: np.ndarray, rank: int) -> tuple[np.ndarray, np.ndarray]:
     """The leading principal directions within the span of orthonormal columns, and the coordinates along them."""
-    projected = matrix @ columns
+    projected = product(matrix, columns)
     with one_blas_thread():
         # The small Gram matrix in float64 keeps what float32 products resolve.
         _, vectors = np.linalg.eigh(projected.T.astype(float) @ projected.astype(float))
     vectors = vectors[:, ::-1][:, :rank].astype(np.float32)
-    return vectors.T @ columns.T, projected @ vectors
+    return product(vectors.T, columns.T), projected @ vectors
 
 
 def _orthonormal(columns: np.ndarray) -> np.ndarray:

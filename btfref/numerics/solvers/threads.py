@@ -1,8 +1,19 @@
-"""Threads of the linear algebra libraries."""
+"""Threads of the linear algebra libraries, and results that do not depend on how many there are."""
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
+from contextvars import ContextVar
+
+import numpy as np
+
+#: Threads that :func:`product` may use: those of BLAS before :func:`reproducible` took them.
+_WORKERS: ContextVar[int] = ContextVar("_WORKERS", default=1)
+
+#: Rows, or columns, of a block of :func:`product`: enough for a BLAS call to be worth it; the same on all machines.
+BLOCK = 512
 
 
 def one_blas_thread() -> AbstractContextManager[object]:
@@ -14,3 +25,59 @@ def one_blas_thread() -> AbstractContextManager[object]:
     from threadpoolctl import threadpool_limits
 
     return threadpool_limits(limits=1, user_api="blas")
+
+
+@contextmanager
+def reproducible() -> Iterator[None]:
+    """Context, or decorator, in which results do not depend on the number of threads: the same seed, the same bytes.
+
+    BLAS, LAPACK and OpenMP split sums by their threads, and a sum in another order rounds differently: iterations carry
+    that on. Here they use one thread each; large products keep the others through :func:`product`, which splits what is
+    independent, in the same blocks on every machine. Libraries that are loaded inside of the context are not reached:
+    enter it again behind their import.
+    """
+    import scipy.linalg  # noqa: F401 - it brings a BLAS of its own, which must be there to be limited
+    from threadpoolctl import threadpool_info, threadpool_limits
+
+    threads = [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+    token = _WORKERS.set(max(_WORKERS.get(), *threads, 1))
+    try:
+        with threadpool_limits(limits=1):
+            yield
+    finally:
+        _WORKERS.reset(token)
+
+
+def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """``a @ b`` in blocks of rows of ``a``, or of columns of ``b`` where there are more, on several threads.
+
+    Parameters
+    ----------
+    a, b : ndarray, shapes (n, k), (k, m)
+
+    Returns
+    -------
+    ndarray, shape (n, m)
+        Within :func:`reproducible` the same to the last bit, whatever the number of threads.
+    """
+    n, m = len(a), b.shape[1]
+    result = np.zeros((n, m), np.result_type(a, b))
+    tall = n >= m
+
+    def block(start: int) -> None:
+        part = slice(start, start + BLOCK)
+        if tall:
+            np.matmul(a[part], b, out=result[part])
+        else:
+            # Contiguous, so that no part is copied and no path through BLAS depends on strides.
+            result[:, part] = a @ np.ascontiguousarray(b[:, part])
+
+    starts = range(0, n if tall else m, BLOCK)
+    workers = min(_WORKERS.get(), len(starts))
+    if workers <= 1:
+        for start in starts:
+            block(start)
+    else:
+        with ThreadPoolExecutor(workers) as pool:
+            list(pool.map(block, starts))
+    return result

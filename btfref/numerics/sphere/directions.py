@@ -191,18 +191,21 @@ def checked(vectors: np.ndarray, name: str, *, file: PathLike | None = None) -> 
 
 
 def _find_rings(theta: np.ndarray, phi: np.ndarray) -> np.ndarray | None:
-    """Ring table of a set with a pole sample and rings of equal steps in index order, or None."""
-    if theta[0] > RING_TOLERANCE:
-        return None
+    """Ring table of rings of equal steps in index order, or None.
+
+    The first is the pole, or every ring has three samples at least: otherwise any directions sorted by polar angle
+    would be rings.
+    """
     starts = np.flatnonzero(np.concatenate([[True], np.abs(np.diff(theta)) > RING_TOLERANCE]))
     counts = np.diff(np.append(starts, len(theta)))
     polar = np.array([theta[s : s + c].mean() for s, c in zip(starts, counts, strict=True)])
-    if counts[0] != 1 or (np.diff(polar) <= 0).any():
+    at_pole = theta[0] <= RING_TOLERANCE
+    if (counts[0] != 1 if at_pole else counts.min() < 3) or (np.diff(polar) <= 0).any():
         return None
     ring = np.repeat(np.arange(len(starts)), counts)
     expected = phi[starts][ring] + (np.arange(len(theta)) - starts[ring]) * (2 * np.pi / counts[ring])
     deviation = np.abs(np.mod(phi - expected + np.pi, 2 * np.pi) - np.pi)
-    if (deviation[1:] * np.sin(theta[1:]) > RING_TOLERANCE).any():
+    if (deviation * np.sin(theta) > RING_TOLERANCE).any():
         return None
-    first_phi = np.where(np.arange(len(starts)) == 0, 0.0, phi[starts])
+    first_phi = np.where((np.arange(len(starts)) == 0) & at_pole, 0.0, phi[starts])
     return np.stack([np.where(polar < RING_TOLERANCE, 0, polar), first_phi, counts, starts], 1)

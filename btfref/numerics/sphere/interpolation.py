@@ -2,9 +2,10 @@
 
 Two kinds of sets, one contract: ``stencil(w)`` returns indices and non-negative weights that sum to 1, are
 continuous in ``w`` and exact at the samples. On ring grids the two neighbouring rings are blended, linear in φ
-on each and linear in θ between them. Any other set is triangulated (spherical Delaunay) and blended with
-barycentric weights. What the ports need is in :meth:`arrays`, in float32; :func:`from_arrays` rebuilds the
-interpolation from those same arrays, so that the float64 definition sees exactly what the ports see.
+on each and linear in θ between them; inside a first ring that is no pole, its two sides (:func:`across_the_cap`).
+Any other set is triangulated (spherical Delaunay) and blended with barycentric weights. What the ports need is in
+:meth:`arrays`, in float32; :func:`from_arrays` rebuilds the interpolation from those same arrays, so that the float64
+definition sees exactly what the ports see.
 """
 
 from __future__ import annotations
@@ -28,13 +29,14 @@ START_CELLS = 32
 
 @dataclass(frozen=True)
 class RingInterpolation:
-    """Interpolation on rings of equally spaced azimuths around a pole sample.
+    """Interpolation on rings of equally spaced azimuths around the pole, with a sample there or without.
 
     Parameters
     ----------
     rings : ndarray, shape (n_rings, 4)
         Polar angle in radians, azimuth of the first sample in radians, number of samples and index of the
-        first sample, for each ring; sorted by polar angle; the first ring is the pole with one sample.
+        first sample, for each ring; sorted by polar angle. The first ring is the pole with one sample, or a ring
+        around it, whose inside is the polar cap.
     """
 
     rings: np.ndarray
@@ -77,17 +79,77 @@ class RingInterpolation:
             following = np.where(first + 1 < count, first + 1, 0)
             indices += [table[ring, 3] + first, table[ring, 3] + following]
             weights += [share * (1 - fraction), share * fraction]
-        weight = np.stack(weights, -1)
+            if ring is low and table[0, 0] > 0:
+                cap = theta < table[0, 0]
+                inset = (table[0, 0] - theta[cap]) / table[0, 0]
+                inner = across_the_cap(first[cap], fraction[cap], inset, table[0, 2])
+        weight, index = np.stack(weights, -1), np.stack(indices, -1)
+        if table[0, 0] > 0:
+            index[cap], weight[cap] = inner[0] + table[0, 3], inner[1]
         if not hold:
             edge = table[last, 0]
             if np.cos(edge) > 1e-6:
                 fade = np.where(theta > edge, np.maximum(z, 0) / np.cos(edge), 1)
                 weight = weight * fade[..., None]
-        return np.stack(indices, -1).astype(np.int64), weight
+        return index.astype(np.int64), weight
 
     def arrays(self, prefix: str) -> dict[str, np.ndarray]:
         """The tables of the ports: ``{prefix}_rings``, float32 (n_rings, 4)."""
         return {f"{prefix}_rings": np.asarray(self.rings, np.float32)}
+
+
+def across_the_cap(
+    first: np.ndarray, fraction: np.ndarray, inset: np.ndarray, count: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Samples and weights inside the first ring of a set without a sample at the pole.
+
+    The ring's samples are the corners of a regular polygon, sample 0 at (1, 0); a direction lies on the way from the
+    middle to where its azimuth meets the polygon's edge, θ / θ_first of it. Its chord at right angles to the axis
+    through sample 0 meets the polygon on either side: linear on both edges, as on the ring itself, and linear along the
+    chord. So functions that are linear in the plane are kept, and the four samples are two neighbouring pairs, as
+    those of two rings are; a mean of all samples at the pole would need them all.
+
+    Parameters
+    ----------
+    first, fraction : ndarray, shape (n,)
+        Sample at or before the azimuth, and the way from there to the next, [0, 1).
+    inset : ndarray, shape (n,)
+        1 − θ / θ_first, [0, 1].
+    count : float
+        Samples of the ring.
+
+    Returns
+    -------
+    index : ndarray, shape (n, 4)
+        On the ring, as floats.
+    weight : ndarray, shape (n, 4)
+        Non-negative, sum 1; for an inset of 0 those of the ring.
+    """
+    step, radius = 2 * np.pi / count, 1 - inset
+    # The lower side is the mirror image of the upper one.
+    lower = first + fraction > count / 2
+    first, fraction = np.where(lower, count - 1 - first, first), np.where(lower, 1 - fraction, fraction)
+    x = radius * ((1 - fraction) * np.cos(step * first) + fraction * np.cos(step * (first + 1)))
+    # The corner at or before the chord on the upper side. Its mirror image is the corner after it on the lower side.
+    corner = np.clip(np.floor(np.arccos(np.clip(x, -1, 1)) / step), 0, max(count // 2 - 1, 0))
+
+    def before(k: np.ndarray) -> np.ndarray:
+        """Cosine at the corner less that at corner k, as a product: near the axis, differences of cosines cancel."""
+        return 2 * np.sin(0.5 * step * (corner + k)) * np.sin(0.5 * step * (k - corner))
+
+    way = (1 - fraction) * before(first) + fraction * before(first + 1)
+    way, width = inset * np.cos(step * corner) + radius * way, before(corner + 1)
+    along = np.clip(way / np.where(width > 0, width, 1), 0, 1)
+    y = radius * ((1 - fraction) * np.sin(step * first) + fraction * np.sin(step * (first + 1)))
+    height = (1 - along) * np.sin(step * corner) + along * np.sin(step * (corner + 1))
+    # At a corner on the axis the chord is a point, and any share of it will do.
+    far = np.clip(0.5 - 0.5 * y / np.maximum(height, 1e-30), 0, 1)
+    below = np.where(lower, 1 - far, far)
+    mirrored = count - 1 - corner
+    index = [corner, np.mod(corner + 1, count), mirrored, np.mod(mirrored + 1, count)]
+    above = 1 - below
+    weight = [above * (1 - along), above * along, below * along, below * (1 - along)]
+    return np.stack(index, -1), np.stack(weight, -1)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ import numpy as np
 
 from btfref.numerics.powers import FLOOR, safe_power
 from btfref.numerics.solvers.levenberg import BatchFit, fit_batch
+from btfref.numerics.solvers.threads import reproducible
 from btfref.precision import real
 from btfref.representations.analytic import light_functions
 from btfref.representations.analytic.lobe_start import exponent_limit
@@ -258,6 +259,7 @@ def lobe_maps(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return lobes.reshape(len(parameters), -1), peaks, parameters[:, 0]
 
 
+@reproducible()
 def fit(
     btf: SampledBTF,
     *,

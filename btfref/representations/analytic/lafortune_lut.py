@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from btfref.numerics.solvers.threads import reproducible
+from btfref.numerics.sphere.quadrature import gauss_hemisphere
 from btfref.representations.analytic import lafortune, light_functions
 from btfref.representations.file.schema import MapSchema, Schema
 from btfref.representations.lookup import positive_integer
@@ -27,10 +29,13 @@ if TYPE_CHECKING:
 
 
 #: "paper": Table 1's four lobes, in floats.
-PRESETS = {"paper": {"lobes": 4, "storage": "float"}}
+PRESETS: dict[str, Facts] = {"paper": {"lobes": 4, "bounded": False, "storage": "float"}}
 
 #: Largest factor; a texel that the model misses altogether from one view must not make it grow without limit.
 FACTOR_BOUND = 8.0
+
+#: Rule over the lights for directional albedos.
+ALBEDO_RULE = (6, 20)
 
 
 class Representation(light_functions.AnalyticMaps):
@@ -68,6 +73,7 @@ class Representation(light_functions.AnalyticMaps):
         return factor[..., None].astype(np.float32) * lafortune.luminance_tables(self.maps, texels, views)
 
 
+@reproducible()
 def fit(
     btf: SampledBTF,
     *,
@@ -75,6 +81,7 @@ def fit(
     progress: Progress | None = None,
     lobes: int = 4,
     rounds: int = 1,
+    bounded: bool = True,
     storage: str = "half",
     filter_type: str = "bilinear",
 ) -> Representation:
@@ -91,6 +98,10 @@ def fit(
         Per texel, at least 1.
     rounds : int
         Refits of the lobes after the first fit; the factor is updated after each. At least 1.
+    bounded : bool
+        The factor is at most what keeps the directional albedo of each measured view, of luminance, at 1, or at that of
+        the data where they have more: least squares at a few lights leave open how bright a lobe is between them.
+        Differs from the paper (False).
     storage : {"half", "float"}
         Type of the stored maps.
     filter_type : {"bilinear", "nearest"}
@@ -112,32 +123,58 @@ def fit(
 
     def fit_block(luminance: np.ndarray) -> tuple[BatchFit, dict[str, np.ndarray]]:
         result = lafortune.fit_lafortune(luminance, btf.views, btf.lights, n_lobes)
-        factor = view_factor(luminance, result.parameters, btf)
+        factor = view_factor(luminance, result.parameters, btf, bounded=bounded)
         for _ in range(rounds):
             result = lafortune.fit_lafortune(
                 luminance, btf.views, btf.lights, n_lobes, start=result.parameters, factor=factor
             )
-            factor = view_factor(luminance, result.parameters, btf)
+            factor = view_factor(luminance, result.parameters, btf, bounded=bounded)
         return result, {"factor": factor.T}
 
-    parameters = {"lobes": n_lobes, "rounds": rounds, "storage": storage, "seed": seed}
+    parameters = {"lobes": n_lobes, "rounds": rounds, "bounded": bounded, "storage": storage, "seed": seed}
     return lafortune.fit_texels(
         Representation, "lafortune_lut", btf, fit_block, parameters, progress, storage, filter_type
     )
 
 
-def view_factor(luminance: np.ndarray, parameters: np.ndarray, btf: SampledBTF) -> np.ndarray:
-    """Least-squares factor of each view and texel, ``Σ_l B M / Σ_l M²`` in [0, 8]; 1 where the model is 0."""
+def view_factor(
+    luminance: np.ndarray, parameters: np.ndarray, btf: SampledBTF, *, bounded: bool = False
+) -> np.ndarray:
+    """Least-squares factor of each view and texel, ``Σ_l B M / Σ_l M²`` in [0, 8]; 1 where the model is 0.
+
+    Parameters
+    ----------
+    luminance : ndarray, shape (view, light, n)
+    parameters : ndarray, shape (n, 1 + 5 k)
+        Of the lobes.
+    btf : SampledBTF
+    bounded : bool
+        See :func:`fit`.
+
+    Returns
+    -------
+    ndarray of float32, shape (view, n)
+    """
     lobes, peaks, diffuse = lafortune.lobe_maps(parameters)
     colour = np.pad(diffuse[:, None], ((0, 0), (3, 0)))
-    maps = {"lobes": lobes, "peaks": peaks, "colour": colour}
-    maps |= {"light_directions": btf.lights.vectors, "view_directions": btf.views.vectors}
+    maps = {"lobes": lobes, "peaks": peaks, "colour": colour, "view_directions": btf.views.vectors}
     texels = np.arange(len(parameters))
+    nodes, solid_angle = gauss_hemisphere(*ALBEDO_RULE)
     factor = np.ones(luminance.shape[::2], np.float32)
     for view in range(len(factor)):
-        model = lafortune.luminance_tables(maps, texels, np.array([view]))[:, 0]
-        square = np.einsum("nl,nl->n", model, model)
-        product = np.einsum("ln,nl->n", luminance[view], model)
+
+        def model(lights: np.ndarray, view: int = view) -> np.ndarray:
+            at = maps | {"light_directions": lights}
+            return lafortune.luminance_tables(at, texels, np.array([view]))[:, 0]
+
+        measured = model(btf.lights.vectors)
+        square = np.einsum("nl,nl->n", measured, measured)
+        product = np.einsum("ln,nl->n", luminance[view], measured)
         known = square > 1e-20
         factor[view, known] = np.clip(product[known] / square[known], 0, FACTOR_BOUND)
+        if bounded:
+            albedo = model(nodes) @ solid_angle.astype(np.float32)
+            limit = np.maximum(1, btf.lights.quadrature_weights @ luminance[view])
+            lit = albedo > 0
+            factor[view, lit] = np.minimum(factor[view, lit], limit[lit] / albedo[lit])
     return factor

@@ -19,6 +19,7 @@ import numpy as np
 from btfref.errors import InputError
 from btfref.numerics.powers import FLOOR, safe_power, unit_lobe
 from btfref.numerics.solvers.levenberg import fit_batch
+from btfref.numerics.solvers.threads import reproducible
 from btfref.precision import real
 from btfref.representations.analytic import light_functions
 from btfref.representations.analytic.lobe_start import (
@@ -206,6 +207,7 @@ def lobe_model(module: ModuleType, data: np.ndarray, lights: np.ndarray, n_lobes
     return model, n_steps
 
 
+@reproducible()
 def fit(
     btf: SampledBTF,
     *,

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from btfref.numerics.solvers.threads import reproducible
 from btfref.precision import real
 from btfref.representations.analytic import light_functions
 from btfref.representations.file.schema import MapSchema, Schema
@@ -109,6 +110,7 @@ def light_operator(lights: np.ndarray) -> tuple[np.ndarray, Facts]:
     }
 
 
+@reproducible()
 def fit(
     btf: SampledBTF,
     *,

@@ -4,6 +4,11 @@ Source: F. Suykens, K. vom Berge, A. Lagae, P. Dutré, "Interactive Rendering wi
 Eurographics 2003, sections 4 and 5. Half-vector factor first: the mean over difference directions (three factors), or
 the leading terms of the half/difference matrix (four factors). Then the data divided by it, element by element, in the
 measured parameterization; the leading terms of that residue are the factors of light and view.
+
+Differs from the paper: the product is refined as a whole, at the samples and at pairs of directions between them, where
+the data are interpolated. Half vectors of measured pairs leave gaps (with 5 azimuths, no view sees the mirror image of
+a light), and in a gap nothing else holds a factor: refined at the samples alone, products of coarse grids reach a
+hundred times the data's maximum there.
 """
 
 from __future__ import annotations
@@ -16,12 +21,15 @@ import numpy as np
 from btfref.numerics.solvers.factoring import (
     TINY,
     FactorOperators,
+    PairOperators,
+    Samples,
     map_operators,
+    pair_map_operators,
     rank_terms,
     refine,
-    sample_weights,
     sparse_operator,
 )
+from btfref.numerics.solvers.threads import reproducible
 from btfref.numerics.sphere.directions import DirectionSet, ring_directions
 from btfref.numerics.sphere.halfway import half_difference, in_out
 from btfref.numerics.sphere.parabolic import texel_directions
@@ -50,6 +58,12 @@ PRESETS = {"paper": {"sweeps": 0, "rescale": False, "storage": "byte", "code": "
 
 #: Step of the difference directions in degrees: the paper's 8 polar angles.
 DIFFERENCE_STEP = 11.25
+
+#: Pairs between the samples for each half vector, with difference vectors drawn from all that lie above the horizon.
+PAIRS_PER_HALF = 4
+
+#: Their directions have at least this z.
+HORIZON = 1e-6
 
 #: Parts of the texels on which the resampling errors are measured.
 N_PROBED_PARTS = 3
@@ -102,9 +116,32 @@ class Resampling:
         self.to_half = (gather @ mean @ self.to_half_difference).tocsr()
         self.to_maps = self._parabolic(views, lights, map_size, four)
         maps = map_operators(views.vectors, lights.vectors, map_size, four)
-        self.through_maps = FactorOperators(
-            **{name: (getattr(maps, name) @ to).tocsr() for name, to in self.to_maps.items()}
-        )
+        self.through_maps = FactorOperators(**self._through(maps))
+        rows, w_light, w_view = self._between()
+        self.to_between = self.to_half_difference[rows]
+        self.between = PairOperators(**self._through(pair_map_operators(w_view, w_light, map_size, four)))
+
+    def _through(self, maps: FactorOperators) -> dict[str, csr_matrix]:
+        """How the factors' samples are read through their maps."""
+        return {name: (getattr(maps, name) @ to).tocsr() for name, to in self.to_maps.items()}
+
+    def _between(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Pairs at which the refinement sees the interpolated data, the same in every fit.
+
+        Returns
+        -------
+        rows : ndarray of int, shape (pair,)
+            Of ``to_half_difference``.
+        w_light, w_view : ndarray, shape (pair, 3)
+        """
+        w_light, w_view = in_out(self.half_set.vectors[:, None], self.difference_set.vectors[None])
+        # On the horizon itself two directions may be opposite, and have no half vector.
+        there = np.minimum(w_light[..., 2], w_view[..., 2]) > HORIZON
+        order = np.random.default_rng(0).random(there.shape) - there
+        picked = np.argsort(order, 1, kind="stable")[:, :PAIRS_PER_HALF]
+        half = np.broadcast_to(np.arange(len(there))[:, None], picked.shape)
+        at = half[there[half, picked]], picked[there[half, picked]]
+        return at[0] * there.shape[1] + at[1], w_light[at], w_view[at]
 
     def _half_difference(self, views: DirectionSet, lights: DirectionSet) -> tuple[csr_matrix, np.ndarray]:
         """Operator (view, light) -> (half, difference), and where both directions are above the horizon."""
@@ -195,6 +232,7 @@ def chain(data: np.ndarray, resampling: Resampling, terms: int, floor: float) ->
     return factors
 
 
+@reproducible()
 def fit(
     btf: SampledBTF,
     *,
@@ -204,6 +242,7 @@ def fit(
     terms: int = 1,
     sweeps: int = 8,
     exponent: float = 0.75,
+    between: float = 0.3,
     floor: float = 1e-3,
     half_step: float = 5.0,
     map_size: int = 32,
@@ -224,7 +263,7 @@ def fit(
         Of the clustering.
     progress : callable, optional
         ``progress(done, total, label)``.
-    difference, terms, sweeps, exponent, floor, half_step, map_size
+    difference, terms, sweeps, exponent, between, floor, half_step, map_size
         Of the factorization: see :func:`factorize`.
     clusters, storage, scale_storage, code, rescale, filter_type
         See :class:`btfref.representations.factored.storage.Storing`.
@@ -250,6 +289,7 @@ def fit(
             terms=terms,
             sweeps=sweeps,
             exponent=exponent,
+            between=between,
             floor=floor,
             half_step=half_step,
             map_size=map_size,
@@ -266,6 +306,7 @@ def factorize(
     terms: int = 1,
     sweeps: int = 8,
     exponent: float = 0.75,
+    between: float = 0.3,
     floor: float = 1e-3,
     half_step: float = 5.0,
     map_size: int = 32,
@@ -286,8 +327,11 @@ def factorize(
         the product as the maps give it. Differs from the paper, which stops after the chain (0): the residue's
         decomposition weighs every sample of the quotient alike, however small the product is there.
     exponent : float
-        Squared errors of the updates and of the scales count (B / mean + 0.1)^−exponent, 0 to 2: 0 favours highlights
-        and the RMSE, 2 shadows and the relative error.
+        Squared errors of the updates and of the scales count (B / mean + 0.1)^−exponent, 0 to 2, B as approximated: 0
+        favours highlights and the RMSE, 2 shadows and the relative error.
+    between : float
+        What pairs between the samples count together in the updates, 0 to 100, where the samples count 1. 0: the
+        factors are free between the samples, and may rise there without bound.
     floor : float
         Share of its mean, [0, 1], below which the half-vector approximation is held when the data are divided by it.
     half_step : float
@@ -305,6 +349,7 @@ def factorize(
         half_step=(half_step, 0.5, 90),
         sweeps=(sweeps, 0, 1000),
         exponent=(exponent, 0, 2),
+        between=(between, 0, 100),
     )
     step("resampling")
     resampling = Resampling(btf.views, btf.lights, half_step, map_size, difference)
@@ -320,7 +365,11 @@ def factorize(
         models = {"factors": resampling.measured.product(factors)}
         if next(done) in probed:
             probes.append(resampling.errors(data, factors))
-        factors = refine(data, factors, resampling.through_maps, sweeps, sample_weights(data, exponent))
+        samples = [Samples(data, resampling.through_maps)]
+        if between > 0:
+            interpolated = resampling.to_between @ data.reshape(-1, data.shape[-1])
+            samples.append(Samples(interpolated, resampling.between, between * data.size / interpolated.size))
+        factors = refine(samples, factors, sweeps, exponent)
         models["maps"] = resampling.through_maps.product(factors)
         maps = {
             name: np.stack([resampling.to_maps[name] @ term for term in factors[name]]) for name in factors
@@ -334,6 +383,7 @@ def factorize(
         "terms": terms,
         "sweeps": sweeps,
         "exponent": exponent,
+        "between": between,
         "floor": floor,
         "half_step": half_step,
         "map_size": map_size,

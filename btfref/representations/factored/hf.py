@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from btfref.numerics.solvers.factoring import map_operators
+from btfref.numerics.solvers.threads import reproducible
 from btfref.numerics.sphere.parabolic import texel_centres
 from btfref.representations.factored.definition import Representation
 from btfref.representations.factored.fit import (
@@ -155,6 +156,7 @@ def logarithms(tables: np.ndarray, floor: float) -> np.ndarray:
     return np.log(np.maximum(tables, floor)).reshape(-1, tables.shape[-1]).astype(float)
 
 
+@reproducible()
 def fit(
     btf: SampledBTF,
     *,

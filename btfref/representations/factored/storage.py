@@ -10,6 +10,7 @@ import numpy as np
 from btfref.errors import InputError
 from btfref.numerics.solvers.factoring import TINY, map_operators, sample_weights
 from btfref.numerics.solvers.lowrank import range_basis
+from btfref.numerics.solvers.threads import product, reproducible
 from btfref.representations.factored.definition import (
     FACTORS,
     Representation,
@@ -146,12 +147,13 @@ def codebook(maps: np.ndarray, clusters: int | None, seed: int) -> tuple[np.ndar
         from sklearn.cluster import KMeans, MiniBatchKMeans
 
         kind = MiniBatchKMeans if len(points) > MINI_BATCH_ABOVE else KMeans
-        labels = kind(clusters, n_init=1, max_iter=50, random_state=seed).fit_predict(points)
+        with reproducible():  # scikit-learn adds up centres thread by thread
+            labels = kind(clusters, n_init=1, max_iter=50, random_state=seed).fit_predict(points)
     labels = np.unique(labels.reshape(-1), return_inverse=True)[1]
     share = np.zeros((int(labels.max()) + 1, len(maps)), np.float32)
     share[labels, np.arange(len(maps))] = 1
     share /= share.sum(1, keepdims=True)
-    return labels, share @ maps
+    return labels, product(share, maps)
 
 
 def stored_maps(name: str, maps: np.ndarray, storage: str, power: int) -> np.ndarray:
@@ -303,7 +305,7 @@ def store(
     }
     meta["index_bytes"] = {"index": 1 if index.max() < 256 else 2}
     step("scales")
-    moments, weighted = _moments(btf, arrays, meta["constants"], half_scale, factors.exponent)
+    moments, weighted = _moments(btf, arrays, meta["constants"], scale, half_scale, factors.exponent)
     error = _error(moments, scale)
     if storing.rescale:
         scale = _fitted_scale(weighted, scale)
@@ -318,9 +320,14 @@ def store(
 
 
 def _moments(
-    btf: SampledBTF, arrays: dict[str, np.ndarray], constants: Facts, half_scale: np.ndarray, exponent: float
+    btf: SampledBTF,
+    arrays: dict[str, np.ndarray],
+    constants: Facts,
+    scale: np.ndarray,
+    half_scale: np.ndarray,
+    exponent: float,
 ) -> tuple[Moments, Moments]:
-    """Inner products of data and unscaled terms, per texel and channel: plain ones and weighted ones.
+    """Inner products of data and unscaled terms, per texel and channel: plain ones, and weighted by the scaled terms.
 
     Returns
     -------
@@ -346,13 +353,15 @@ def _moments(
         half = operators.half(factors)
         p, r = operators.read("p", factors["p"]), operators.read("r", factors["r"])
         terms = np.stack([half * a[:, None] * b for a, b in zip(r, p, strict=True)])
-        for part, weight in zip(parts, (1, sample_weights(data, exponent)), strict=True):
+        amount = np.moveaxis(scale[texels], 0, 1).reshape(len(terms), -1) / np.where(mean > 0, mean, 1)
+        model = np.einsum("kvlm,km->vlm", terms, amount.astype(np.float32))
+        for part, weight in zip(parts, (1, sample_weights(model, exponent)), strict=True):
             heavy = weight * terms
-            scale = mean.astype(float)
+            size = mean.astype(float)
             part.append(
                 (
-                    np.einsum("vlm,vlm->m", weight * data, data) * scale**2,
-                    np.einsum("vlm,kvlm->mk", data, heavy) * scale[:, None],
+                    np.einsum("vlm,vlm->m", weight * data, data) * size**2,
+                    np.einsum("vlm,kvlm->mk", data, heavy) * size[:, None],
                     np.einsum("jvlm,kvlm->mjk", terms, heavy).astype(float),
                 )
             )

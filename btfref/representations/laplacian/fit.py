@@ -10,6 +10,7 @@ from btfref.errors import InputError
 from btfref.numerics.phong import fit_phong, phong
 from btfref.numerics.pyramid import expand_image, gaussian_pyramid, level_shapes
 from btfref.numerics.solvers.lowrank import range_basis, texel_matrix
+from btfref.numerics.solvers.threads import product, reproducible
 from btfref.numerics.ycbcr import CHANNELS, FROM_RGB, RGB_METRIC, RGB_WEIGHT
 from btfref.representations.analytic.light_functions import edge_constants
 from btfref.representations.laplacian.levels import Representation, level_constants
@@ -42,6 +43,7 @@ _CHOICES = {
 }
 
 
+@reproducible()
 def fit(
     btf: SampledBTF,
     *,
@@ -264,7 +266,9 @@ class _Levels:
                 total += expand_image(level, shape, self.filter_type).reshape(total.shape)
         else:
             for weights, basis in self.kept[channel]:
-                total += expand_image(weights, shape, self.filter_type).reshape(len(total), -1) @ basis
+                total += product(
+                    expand_image(weights, shape, self.filter_type).reshape(len(total), -1), basis
+                )
         return total
 
     def compress(self, k: int, counts: tuple[int, int, int] | None, target: float | None) -> list[int]:
@@ -334,7 +338,7 @@ class _Levels:
 
 def _product(part: StoredChannel) -> np.ndarray:
     weights, basis = (a.astype(np.float32) for a in part)
-    return weights @ basis
+    return product(weights, basis)
 
 
 def _gram(arrays: Sequence[np.ndarray]) -> np.ndarray:

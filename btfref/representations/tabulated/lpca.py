@@ -15,7 +15,7 @@ import numpy as np
 from btfref import conventions
 from btfref.numerics.solvers.clustering import leading_axes, local_pca
 from btfref.numerics.solvers.lowrank import range_basis, refined_basis, texel_matrix
-from btfref.numerics.solvers.threads import one_blas_thread
+from btfref.numerics.solvers.threads import one_blas_thread, reproducible
 from btfref.precision import real
 from btfref.representations.file.resident import refuse_absent
 from btfref.representations.file.schema import INDICES, MapSchema, Number, Schema
@@ -147,6 +147,7 @@ class Representation(StoredMaps):
         return labels.reshape(self.maps["cluster"].shape[:2]), mean
 
 
+@reproducible()
 def fit(
     btf: SampledBTF,
     *,

@@ -12,6 +12,7 @@ import numpy as np
 
 from btfref import conventions
 from btfref.numerics.solvers.lowrank import range_basis, texel_matrix
+from btfref.numerics.solvers.threads import reproducible
 from btfref.precision import real
 from btfref.representations.file.schema import MapSchema, Number, Schema
 from btfref.representations.guide import feature_views, group_means, texel_groups
@@ -88,6 +89,7 @@ class Representation(StoredMaps):
         return labels.reshape(weights.shape[:2]), np.tensordot(group_means(labels, flat), basis, 1)
 
 
+@reproducible()
 def fit(
     btf: SampledBTF,
     *,

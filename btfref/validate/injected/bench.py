@@ -27,6 +27,8 @@ from btfref.validate.method_gates import sampling_gates
 from btfref.validate.own_renderer import EIGHT_BIT, NOISY
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from btfref.rendering import RenderResult
     from btfref.representations.protocol import Representation
     from btfref.sampling import SampledBTF
@@ -47,6 +49,26 @@ CHI2_SAMPLES = 200_000
 
 #: What a look at a fault returns.
 Gates = Sequence[GateResult]
+
+
+#: Factors that a representation's values are off by.
+OFF = {"dark": 0.5, "negative": -1.0}
+
+
+class Off:
+    """A representation whose values are off by a factor."""
+
+    def __init__(self, inner: Representation, factor: float) -> None:
+        self._inner, self._factor = inner, factor
+
+    def evaluate(self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike) -> np.ndarray:
+        """The other's value times the factor."""
+        return self._factor * self._inner.evaluate(uv, w_light, w_view)
+
+
+def _rough(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Values with a texture over directions that no product follows."""
+    return values * np.exp(rng.normal(size=values.shape))
 
 
 class Altered:
@@ -219,6 +241,18 @@ class Bench:
                 )
             found = testify(path)
         return [*found.gates(), *found.between()]
+
+    def between(self, subject: Subject, change: str = "") -> Gates:
+        """A fit between its samples; the fault is one that is free there, too dark, or below zero."""
+        from btfref.registry import method as row
+        from btfref.representations import between
+
+        key, parameters = subject
+        rough = bumpy(shape=(2, 2), views="10x5", lights="10x5", change=_rough)
+        free: Facts = {"between": 0.0, "sweeps": 60} if change == "free" else {}
+        fitted = row(key).fit(rough, **dict(parameters), **free)
+        off = Off(fitted, OFF.get(change, 1.0))
+        return between.gates(key, between.measure(off, rough))
 
     def probes(self, subject: Subject) -> Gates:
         """The shader against the definition, at all levels of detail where there are any."""

@@ -182,5 +182,20 @@ FAULTS = (
     Fault("density of another view", "chi2.rejected.tests", "sampling", change="density"),
     Fault("weight that is not value over density", "sample.weight.max", "sampling", change="weight"),
     Fault("density that pdf() does not give", "sample.pdf.max", "sampling", change="pdf"),
+    Fault("factors free between the samples", "fit.between_samples.peak", "between", "cmf", change="free"),
+    Fault(
+        "half of the light lost between the samples",
+        "fit.between_samples.min_mean_ratio",
+        "between",
+        "cmf",
+        change="dark",
+    ),
+    Fault(
+        "below zero between the samples",
+        "fit.between_samples.negative_fraction",
+        "between",
+        "cmf",
+        change="negative",
+    ),
     Fault("batches that share their random numbers", "waterfall.closure.z", "batches", change="shared"),
 )

@@ -28,10 +28,10 @@ def make_fit(cache: Cache, mesostructure: str, method: str, settings: Settings) 
     pathlib.Path
     """
     from btfref.registry import method as row
-    from btfref.representations import save
+    from btfref.representations import between, save
 
     def save_fit(path: Path) -> None:
         btf = load_material(make_material(cache, mesostructure, settings)[0])
-        save(row(method).fit(btf, seed=settings.seed), path)
+        save(between.fit(row(method), btf, seed=settings.seed), path)
 
     return cache.get(fit_key(mesostructure, method, settings), f".{method}.exr", save_fit)

@@ -1,25 +1,71 @@
-// Provides ring_stencil: neighbours of a direction among samples on rings, linear in azimuth and in polar angle.
+// Provides ring_stencil: neighbours of a direction among samples on rings and inside the first, where that is no pole.
 // Expects a table with one texel a ring: polar angle, azimuth of the first sample, samples, index of the first.
 
 #include "lib/lookup/angles.glsl"
 #include "lib/lookup/stencil.glsl"
 #include "lib/lookup/table.glsl"
 
-// Samples and weights on one ring: (first, following), (1 - fraction, fraction).
-void ring_neighbours(vec4 ring, Angle azimuth, float share, out ivec2 index, out vec2 weight) {
+// Sample of a ring at or before an azimuth, and the way from there to the next.
+void ring_position(vec4 ring, Angle azimuth, out float first, out float fraction) {
     float count = ring.z;
     // Whole samples are split off before the remainder is added: 1e-7 of a step remains, not 1e-7 of a turn.
     float position = azimuth.eighths * count * 0.125 - ring.y * count * INVERSE_TWO_PI;
     float whole = floor(position);
-    float fraction = (position - whole) + azimuth.rest * count * INVERSE_TWO_PI;
+    fraction = (position - whole) + azimuth.rest * count * INVERSE_TWO_PI;
     float carry = floor(fraction);
     fraction -= carry;
     whole += carry;
     // Half a sample away from the integers, the quotient cannot round to the wrong side.
-    float first = whole - count * floor((whole + 0.5) / count);
+    first = whole - count * floor((whole + 0.5) / count);
+}
+
+// Samples and weights on one ring: (first, following), (1 - fraction, fraction).
+void ring_neighbours(vec4 ring, Angle azimuth, float share, out ivec2 index, out vec2 weight) {
+    float count = ring.z, first, fraction;
+    ring_position(ring, azimuth, first, fraction);
     float following = first + 1.0 < count ? first + 1.0 : 0.0;
     index = ivec2(int(ring.w + first), int(ring.w + following));
     weight = share * vec2(1.0 - fraction, fraction);
+}
+
+// cos(turn i) - cos(turn k) as a product: near the axis, differences of cosines cancel.
+float corner_step(float turn, float i, float k) {
+    return 2.0 * sin(0.5 * turn * (i + k)) * sin(0.5 * turn * (k - i));
+}
+
+// Inside a first ring that is no pole; inset is 1 - theta / theta_first. The ring's samples are the corners of a regular
+// polygon; a chord of it is blended linearly between the two edges that it meets. See across_the_cap in
+// btfref/numerics/sphere/interpolation.py.
+Stencil cap_stencil(vec4 ring, Angle azimuth, float inset) {
+    float count = ring.z, turn = 6.28318530717958648 / count, radius = 1.0 - inset, first, fraction;
+    ring_position(ring, azimuth, first, fraction);
+    // The lower side is the mirror image of the upper one.
+    bool lower = first + fraction > 0.5 * count;
+    first = lower ? count - 1.0 - first : first;
+    fraction = lower ? 1.0 - fraction : fraction;
+    float a = turn * first, b = turn * (first + 1.0);
+    vec2 place = radius * mix(vec2(cos(a), sin(a)), vec2(cos(b), sin(b)), fraction);
+    // The built-in acos of Mesa is off by 1e-4, which would take the wrong corner.
+    float x = clamp(place.x, -1.0, 1.0);
+    Angle chord = angle_of(sqrt((1.0 - x) * (1.0 + x)), x);
+    float position = (chord.eighths * QUARTER_PI_HIGH + chord.rest) / turn;
+    float corner = clamp(floor(position), 0.0, max(floor(0.5 * count) - 1.0, 0.0));
+    float way = mix(corner_step(turn, corner, first), corner_step(turn, corner, first + 1.0), fraction);
+    way = inset * cos(turn * corner) + radius * way;
+    float width = corner_step(turn, corner, corner + 1.0);
+    float along = width > 0.0 ? clamp(way / width, 0.0, 1.0) : 0.0;
+    float height = mix(sin(turn * corner), sin(turn * (corner + 1.0)), along);
+    // 1e-30: at a corner on the axis the chord is a point, and any share of it will do.
+    float far = clamp(0.5 - 0.5 * place.y / max(height, 1e-30), 0.0, 1.0);
+    float below = lower ? 1.0 - far : far;
+    // Opposite sample numbers: the chord's lower end lies as far after sample 0 as its upper end lies before it.
+    float mirrored = count - 1.0 - corner;
+    vec4 at = vec4(corner, corner + 1.0, mirrored, mirrored + 1.0);
+    at -= count * floor((at + 0.5) / count);
+    float above = 1.0 - below;
+    return Stencil(
+        ivec4(ring.w + at),
+        vec4(above * (1.0 - along), above * along, below * along, below * (1.0 - along)));
 }
 
 // Beyond the last ring its samples are held.
@@ -29,6 +75,9 @@ Stencil ring_stencil(sampler2DArray rings, int n_rings, vec3 w) {
     vec4 low = table_fetch(rings, 0);
     vec4 high = low;
     float above = angle_minus(polar, low.x);
+    if (above < 0.0) {
+        return cap_stencil(low, azimuth, -above / low.x);
+    }
     float t = 0.0;
     for (int i = 1; i < n_rings; ++i) {
         high = table_fetch(rings, i);

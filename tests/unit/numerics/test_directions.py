@@ -13,7 +13,7 @@ from btfref.numerics.sphere.parabolic import hemisphere_to_square, solid_angle_d
 from btfref.numerics.sphere.quadrature import gauss_hemisphere
 
 EXACT = tolerance("interpolation.exact.max")
-NAMES = ("ubo81", "ubo151", "10x5", "16x8", "scattered")
+NAMES = ("ubo81", "ubo151", "10x5", "16x8", "2x3", "3x12", "scattered")
 
 
 def direction_set(name):
@@ -83,6 +83,56 @@ def test_exact_at_the_samples(some):
     weight_of_own = np.where(index == np.arange(len(some))[:, None], weight, 0).sum(-1)
     # Tables are float32, so that the definition sees what the ports see.
     np.testing.assert_allclose(weight_of_own, 1, atol=tolerance("interpolation.float32.max"))
+
+
+def in_the_cap(some, rng, n):
+    """Directions inside the first ring."""
+    theta, phi = some.rings[0, 0] * rng.random(n), 2 * np.pi * rng.random(n)
+    return spherical(theta, phi)
+
+
+@pytest.mark.parametrize("name", ["10x5", "16x8", "2x3", "3x12"])
+def test_the_cap_is_continuous_and_keeps_the_plane(name, rng):
+    """Rings without a pole: no seam at the ring nor at the chords; what is linear in the plane of the polygon stays."""
+    some = direction_set(name)
+    value, w = rng.random(len(some)), in_the_cap(some, rng, 20_000)
+    index, weight = some.stencil(w)
+    assert (weight >= 0).all()
+    assert index.max() < some.rings[0, 2]
+    np.testing.assert_allclose(weight.sum(-1), 1, atol=EXACT)
+    edge, phi = some.rings[0, 0], 2 * np.pi * rng.random(5_000)
+    sides = [
+        np.einsum("nk,nk->n", weight, value[index])
+        for index, weight in (some.stencil(spherical(edge + e, phi)) for e in (-1e-9, 1e-9))
+    ]
+    assert np.abs(sides[0] - sides[1]).max() <= tolerance("interpolation.continuity.max")
+    # A moved direction changes the value by no more than the steepest slope: the width of the cap's narrowest part.
+    near = w + 1e-9 * rng.normal(size=w.shape)
+    index_near, weight_near = some.stencil(near / np.linalg.norm(near, axis=1, keepdims=True))
+    change = np.einsum("nk,nk->n", weight, value[index]) - np.einsum(
+        "nk,nk->n", weight_near, value[index_near]
+    )
+    assert np.abs(change).max() <= tolerance("interpolation.continuity.max")
+    corners = np.exp(1j * some.phi[: int(some.rings[0, 2])])
+    place = np.einsum("nk,nk->n", weight, corners[index])
+    turn = np.angle(w[:, 0] + 1j * w[:, 1])
+    radius = np.arctan2(np.hypot(w[:, 0], w[:, 1]), w[:, 2]) / edge
+    # The way to the polygon's edge is divided as the chord of two corners by the azimuth between them.
+    step = 2 * np.pi / some.rings[0, 2]
+    share = np.mod(turn, step) / step
+    first = np.exp(1j * (turn - share * step))
+    expected = radius * first * (1 - share + share * np.exp(1j * step))
+    np.testing.assert_allclose(place, expected, atol=tolerance("interpolation.float32.max"))
+
+
+def test_only_rings_around_the_pole_are_rings():
+    """Any directions in the order of their polar angles would be rings of one sample each, or of two."""
+    phi = np.arange(6) * 2.4
+    assert directions(spherical(0.2 + 0.1 * np.arange(6), phi)).rings is None
+    pairs = spherical(np.repeat([0.3, 0.6, 0.9], 2), [0, np.pi, 1, 1 + np.pi, 2, 2 + np.pi])
+    assert directions(pairs).rings is None
+    threes = spherical(np.repeat([0.3, 0.6], 3), np.tile(np.arange(3) * 2 * np.pi / 3, 2) + 0.4)
+    np.testing.assert_allclose(directions(threes).rings[:, 1:], [[0.4, 3, 0], [0.4, 3, 3]], atol=EXACT)
 
 
 def test_continuous(some, rng):

@@ -129,9 +129,36 @@ def test_sweeps_never_raise_the_error():
     errors = []
     for _ in range(5):
         errors.append(((resampling.through_maps.product(factors) - data) ** 2).sum(dtype=float))
-        factors = factoring.refine(data, factors, resampling.through_maps, 1)
+        factors = factoring.refine([factoring.Samples(data, resampling.through_maps)], factors, 1)
         assert min(f.min() for f in factors.values()) >= 0
     assert (np.diff(errors) < 0).all()
+
+
+def test_listed_pairs_are_read_as_the_grid_is(rng):
+    """All pairs of a grid, as a list: the same products, and the same updates."""
+    views, lights = upper(rng, 5), upper(rng, 4)
+    grid = factoring.map_operators(views, lights, 8, True)
+    listed = factoring.pair_map_operators(np.repeat(views, 4, 0), np.tile(lights, (5, 1)), 8, True)
+    factors = {name: rng.random((2, 64, 3)).astype(np.float32) for name in "pqrd"}
+    data = rng.random((5, 4, 3)).astype(np.float32)
+    expected = factoring.refine([factoring.Samples(data, grid)], factors, 2, 0.75)
+    found = factoring.refine([factoring.Samples(data.reshape(20, 3), listed)], factors, 2, 0.75)
+    for name in factors:
+        np.testing.assert_allclose(found[name], expected[name], rtol=tolerance("factored.svd.rtol"))
+
+
+@pytest.mark.parametrize("four", [False, True])
+def test_more_sweeps_raise_nothing_between_the_samples(rng, four):
+    """Five azimuths see no view's mirror image; rough tables, which no product follows, try what no sample holds."""
+    btf = oracle_btf((2, 2), "10x5", "10x5")
+    btf = dataclasses.replace(btf, values=np.exp(2 * rng.normal(size=btf.values.shape)).astype(np.float32))
+    w_light, w_view, uv = upper(rng, 4000), upper(rng, 4000), rng.random((4000, 2))
+    limit = tolerance("factored.between.max_peak")
+    # Four factors take more sweeps to get rid of what the chain leaves.
+    for sweeps, between in ((60 if four else 8, 0.3), (120, 0.3), (60, 0.0)):
+        fitted = cmf.fit(btf, sweeps=sweeps, between=between, difference=four, clusters=None)
+        held = fitted.evaluate(uv, w_light, w_view).max() <= limit * btf.values.max()
+        assert held == (between > 0)
 
 
 @pytest.mark.parametrize("key", KEYS)
@@ -148,9 +175,10 @@ def test_chain_alone_recovers_a_product():
 
 
 def test_four_factors_and_more_terms_pay():
+    """At the samples; between them the interpolated data, which are no product, allow all of them the same."""
     btf = product_btf(difference=True)
     errors = {
-        name: fit("cmf", btf, **kw).meta["fit"]["error"]
+        name: fit("cmf", btf, between=0, **kw).meta["fit"]["error"]
         for name, kw in {
             "three": {},
             "four": {"difference": True},

@@ -8,6 +8,7 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.heightfield import HEIGHT_LIMIT, HeightField
+from btfref.numerics.solvers.threads import reproducible
 from btfref.outputs import new_file
 from btfref.representations.gbrdf.build import from_maps
 from btfref.representations.gbrdf.decomposition import heights as height_stage
@@ -37,6 +38,7 @@ PRESETS = {
 }
 
 
+@reproducible()
 def fit(
     btf: SampledBTF,
     *,

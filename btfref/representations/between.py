@@ -1,0 +1,194 @@
+"""How wrong a fit is between its samples: at random directions and texels, where renders look.
+
+The error at the samples, which every fit states, says nothing of what a method does between them. The yardstick here is
+the data's own interpolation, what :mod:`btfref.representations.tabulated.raw` returns. On coarse grids that smears
+highlights and is no truth itself; ``btfref bench between`` measures both against path-traced values.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from btfref.gates.tolerances import gate_keys, gate_table, limits
+from btfref.gates.verdicts import GateResult, judge
+from btfref.numerics.solvers.threads import reproducible
+from btfref.numerics.sphere.quadrature import gauss_hemisphere
+from btfref.representations.lookup import CHUNK
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import ArrayLike
+
+    from btfref.registry import Method
+    from btfref.representations.protocol import Representation
+    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.types import Progress
+
+#: The gate that judges these figures.
+GATE = "fit.between_samples"
+
+#: Random lookups: 16 of them lie above the 99.9th percentile.
+LOOKUPS = 1 << 14
+
+#: Random texels and views whose directional albedo is measured, and the rule over the lights: 13 degrees between nodes
+#: of one polar angle, which a lobe of cos¹⁰⁰ fills.
+ALBEDOS, ALBEDO_RULE = 128, (8, 28)
+
+
+def fit(
+    method: Method, btf: SampledBTF, *, seed: int = 0, progress: Progress | None = None, **parameters: Any
+) -> Representation:
+    """Fit a method, and say in its file how wrong it is between the samples.
+
+    Parameters
+    ----------
+    method : btfref.registry.Method
+    btf : SampledBTF
+    seed, progress, **parameters
+        Of the method's ``fit``.
+
+    Returns
+    -------
+    Representation
+        ``meta["fit"]["between_samples"]`` holds what :func:`measure` finds; all else is as the method made it.
+    """
+    with reproducible():
+        made = method.fit(btf, seed=seed, progress=progress, **parameters)
+    facts = dict(made.meta.get("fit", {})) | {"between_samples": measure(made, btf)}
+    return method.representation.from_arrays(made.arrays(), {**made.meta, "fit": facts})
+
+
+class Evaluates(Protocol):
+    """What is measured: anything with the ``evaluate`` of a representation."""
+
+    def evaluate(self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike) -> np.ndarray:
+        """See :meth:`btfref.representations.protocol.Representation.evaluate`."""
+
+
+def measure(representation: Evaluates, btf: SampledBTF, *, seed: int = 0) -> dict[str, float]:
+    """Figures of a representation at random directions, uniform on the hemisphere, and at random texels.
+
+    Parameters
+    ----------
+    representation : Representation
+        Or anything with its ``evaluate``.
+    btf : SampledBTF
+        What it was fitted to.
+    seed : int
+        Of the lookups: equal seeds, equal lookups.
+
+    Returns
+    -------
+    dict of str to float
+        ``peak`` and ``peak_p999``: largest value and 99.9th percentile of |B|, over the data's largest value;
+        ``mean_ratio``: mean of B over that of the data's interpolation; ``rms_to_data``: RMS difference to that
+        interpolation over its RMS; ``albedo``: the largest directional albedo, ∫ B over the lights, of a texel, view
+        and channel, ``data_albedo``, that of the interpolation at the same places, which coarse grids take above 1 by
+        themselves, and ``albedo_excess``, the one over the other or over 1, whichever is more;
+        ``negative_fraction``: share of negative values. NaN where data without light leave no quotient.
+    """
+    rng = np.random.default_rng(seed)
+    with reproducible():
+        uv, texel = _texels(rng, LOOKUPS, btf)
+        w_light, w_view = _uniform(rng, LOOKUPS), _uniform(rng, LOOKUPS)
+        found = representation.evaluate(uv, w_light, w_view)
+        raw = interpolated(btf, texel, w_light, w_view)
+        uv, texel = _texels(rng, ALBEDOS, btf)
+        w_view = _uniform(rng, ALBEDOS)
+        lights, weight = gauss_hemisphere(*ALBEDO_RULE)
+        w_light = _turned(lights, 2 * np.pi * rng.random(ALBEDOS))
+        albedo = weight @ representation.evaluate(uv[:, None], w_light, w_view[:, None])
+        data_albedo = weight @ interpolated(
+            btf,
+            np.repeat(texel, len(lights)),
+            w_light.reshape(-1, 3),
+            np.repeat(w_view, len(lights), 0),
+        ).reshape(ALBEDOS, -1, 3)
+    largest = max(float(np.max(view)) for view in btf.values)
+    size = np.abs(found)
+    return {
+        "peak": _over(size.max(), largest),
+        "peak_p999": _over(np.quantile(size, 0.999), largest),
+        "mean_ratio": _over(found.mean(), raw.mean()),
+        "rms_to_data": _over(np.sqrt(np.mean((found - raw) ** 2)), np.sqrt(np.mean(raw**2))),
+        "albedo": float(albedo.max()),
+        "data_albedo": float(data_albedo.max()),
+        "albedo_excess": float(albedo.max() / max(data_albedo.max(), 1.0)),
+        "negative_fraction": float(np.mean(found < 0)),
+    }
+
+
+def gates(method: str, facts: Mapping[str, float]) -> list[GateResult]:
+    """The limits of ``fit.between_samples``, and in their place those that a method brings, applied to the figures.
+
+    Parameters
+    ----------
+    method : str
+        Registry key.
+    facts : dict
+        Of :func:`measure`; what the gate does not limit is left out.
+
+    Returns
+    -------
+    list of GateResult
+    """
+    own = f"{GATE}.{method}"
+    key = own if own in gate_keys() else GATE
+    names = {entry.removeprefix("min_") for entry in limits(gate_table(key))}
+    found = judge(key, {name: facts[name] for name in facts.keys() & names})
+    # One name whoever's limits they are.
+    return [replace(gate, name=f"{GATE}.{gate.entry}") for gate in found]
+
+
+def interpolated(btf: SampledBTF, texel: np.ndarray, w_light: np.ndarray, w_view: np.ndarray) -> np.ndarray:
+    """The data of some texels, interpolated over directions as by all tabulated methods.
+
+    Parameters
+    ----------
+    btf : SampledBTF
+    texel : ndarray of int, shape (n,)
+        Flat indices.
+    w_light, w_view : ndarray, shape (n, 3)
+
+    Returns
+    -------
+    ndarray of float64, shape (n, 3)
+    """
+    values = btf.values.reshape(*btf.values.shape[:2], -1, 3)
+    result = np.zeros((len(texel), 3))
+    for start in range(0, len(texel), CHUNK):
+        part = slice(start, start + CHUNK)
+        view, view_weight = btf.views.stencil(w_view[part])
+        light, light_weight = btf.lights.stencil(w_light[part], hold=False)
+        found = values[view[:, :, None], light[:, None], texel[part, None, None]].astype(float)
+        result[part] = np.einsum("nv,nl,nvlc->nc", view_weight, light_weight, found)
+    return result
+
+
+def _texels(rng: np.random.Generator, n: int, btf: SampledBTF) -> tuple[np.ndarray, np.ndarray]:
+    """Random texels' centres and flat indices."""
+    rows, columns = btf.values.shape[2:4]
+    row, column = rng.integers(0, rows, n), rng.integers(0, columns, n)
+    return np.stack([(column + 0.5) / columns, (row + 0.5) / rows], -1), row * columns + column
+
+
+def _uniform(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Directions of the upper hemisphere, uniform in solid angle, shape (n, 3)."""
+    z, phi = 1 - rng.random(n), 2 * np.pi * rng.random(n)
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
+
+
+def _turned(w: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Directions turned about the normal, shapes (n, 3), (m,) -> (m, n, 3): a rule's nodes fall elsewhere each time."""
+    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    x, y, z = w.T
+    return np.stack([cos * x - sin * y, sin * x + cos * y, np.broadcast_to(z, (len(angle), len(z)))], -1)
+
+
+def _over(value: float, whole: float) -> float:
+    return float(value / whole) if whole > 0 else float("nan")
