@@ -148,12 +148,28 @@ def _client(
             got=repr(scheduler),
             expected="dask, or an address such as tcp://…",
         )
+    with _silent_logs():
+        try:
+            client = distributed.Client(scheduler, timeout=20)
+        except (OSError, ValueError, TimeoutError) as error:
+            raise InputError("cannot reach the scheduler", field="scheduler", got=scheduler) from error
+        with client:
+            yield client, {"memory": memory, "threads": None}
+
+
+@contextlib.contextmanager
+def _silent_logs() -> Iterator[None]:
+    """Dask's own lines about connections are left out: what they come to is an error of ours."""
+    import logging
+
+    handlers = [(handler, handler.level) for handler in logging.getLogger("distributed").handlers]
+    for handler, _ in handlers:
+        handler.setLevel(logging.CRITICAL)
     try:
-        client = distributed.Client(scheduler, timeout=20)
-    except (OSError, ValueError, TimeoutError) as error:
-        raise InputError("cannot reach the scheduler", field="scheduler", got=scheduler) from error
-    with client:
-        yield client, {"memory": memory, "threads": None}
+        yield
+    finally:
+        for handler, level in handlers:
+            handler.setLevel(level)
 
 
 def _distribute(

@@ -233,7 +233,7 @@ def run(examples, material, tmp_path, monkeypatch, capfd):
 
 @pytest.mark.filterwarnings("ignore")
 def test_random_commands(material, tmp_path, monkeypatch, capfd):
-    run(60, material, tmp_path, monkeypatch, capfd)
+    run(30, material, tmp_path, monkeypatch, capfd)
 
 
 @pytest.mark.long

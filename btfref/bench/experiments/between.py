@@ -143,7 +143,6 @@ def _measured(
     rows = methods()
     found: Facts = {}
     seconds: Facts = {}
-    true_values = None if truth is None else truth.values.astype(float)
     yardstick = None if truth is None else at_pairs(rows["raw"].fit(btf), truth)
     for i, key in enumerate(keys):
         options.tell(i, len(keys), f"between the samples: {key}")
@@ -152,15 +151,19 @@ def _measured(
         middle = time.perf_counter()
         found[key] = {"error": made.meta.get("fit", {}).get("error"), **between.measure(made, btf)}
         seconds[key] = {"fit": middle - start, "measurement": time.perf_counter() - middle}
-        if truth is not None:
-            value = at_pairs(made, truth)
-            error, of_raw = (np.sqrt(np.mean((v - true_values) ** 2)) for v in (value, yardstick))
-            found[key] |= {
-                "rms_truth": float(error / of_raw) if of_raw > 0 else None,
-                "mean_truth": float(value.mean() / true_values.mean()),
-                "nrmse_truth": float(error / np.sqrt(np.mean(np.square(true_values)))),
-            }
+        if truth is not None and yardstick is not None:
+            found[key] |= _against_truth(at_pairs(made, truth), yardstick, truth.values.astype(float))
     return found, seconds
+
+
+def _against_truth(value: np.ndarray, yardstick: np.ndarray, true_values: np.ndarray) -> Facts:
+    """Errors of values and of those of ``raw``, arrays of one shape."""
+    error, of_raw = (float(np.sqrt(np.mean((v - true_values) ** 2))) for v in (value, yardstick))
+    return {
+        "rms_truth": error / of_raw if of_raw > 0 else None,
+        "mean_truth": float(value.mean() / true_values.mean()),
+        "nrmse_truth": error / float(np.sqrt(np.mean(np.square(true_values)))),
+    }
 
 
 def at_pairs(representation: Representation, truth: SampledBTF) -> np.ndarray:
