@@ -47,7 +47,7 @@ def judge_pictures(key: str, comparison: Comparison, masks: Mapping[str, np.ndar
         raise InputError("unknown pixel class", file="tolerances.toml", field=f"{key}.class", got=name)
     mask = np.any([masks[one] for one in names if one in masks], axis=0)
     covered = comparison.classes != PixelClass.BACKGROUND
-    share = np.count_nonzero(mask & covered) / max(np.count_nonzero(covered), 1)
+    share = int(np.count_nonzero(mask & covered)) / max(int(np.count_nonzero(covered)), 1)
     if wanted == ["judged_share"]:
         return judge(key, {"judged_share": share}, pixel_class=name)
     if wanted == ["nonfinite"]:

@@ -191,7 +191,7 @@ class DrJit(Evaluator):
         light = to_device(mi.Vector3f, np.asarray(w_light).T)
         # A level for each lookup is no parameter of the plugin: it goes to the plugin's evaluator directly.
         own_levels = lod is not None and isinstance(self.plugin.evaluator, LevelledEvaluator)
-        levels = to_device(mi.Float, np.broadcast_to(lod, len(uv))) if own_levels else None
+        levels = to_device(mi.Float, np.broadcast_to(np.asarray(lod), len(uv))) if own_levels else None
         dr.eval(si, light, levels)
 
         def compute() -> JitArray:

@@ -13,7 +13,7 @@ from btfref.comparison import compare
 from btfref.errors import InputError
 from btfref.images import load_image
 from btfref.provenance.code import code_of
-from btfref.scene.files import digest_of, scene_facts
+from btfref.scene.facts import digest_of, scene_facts
 from btfref.scene.shipped import scene_file
 from btfref.validate.cache import Cache, digest, key_of
 

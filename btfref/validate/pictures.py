@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from btfref.scene.files import scene_facts
+from btfref.scene.facts import scene_facts
 from btfref.scene.shipped import scene_file
 from btfref.validate.cache import key_of
 from btfref.validate.material import load_material, make_material, material_key

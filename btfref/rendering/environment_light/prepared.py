@@ -26,7 +26,7 @@ BLOCK = 1 << 18
 Evaluate = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 #: Triangles (N,) and barycentric coordinates (N, 3) of the points.
-Place = Callable[[], tuple[np.ndarray, np.ndarray]]
+Place = Callable[[], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 #: ``radiance(uv, w_view, to_world, evaluate=…, place=…)`` in float64, shape (N, 3).
 Radiance = Callable[..., np.ndarray]

@@ -230,12 +230,13 @@ class Bench:
         from btfref.validate.self_test import edited_shader
         from btfref.validate.witness.gates import testify
 
-        path, hand_of = self.fit(subject)[1], plugin.hand_of
+        path, names = self.fit(subject)[1], vars(plugin)
+        hand_of = names["hand_of"]
         right, wrong = "dot(side, normal) < 0.0 ? -1.0 : 1.0", "1.0"
         with ExitStack() as faults:
             if change == "hand":
-                plugin.hand_of = lambda si: 1.0
-                faults.callback(setattr, plugin, "hand_of", hand_of)
+                names["hand_of"] = lambda si: 1.0
+                faults.callback(names.__setitem__, "hand_of", hand_of)
                 faults.enter_context(
                     edited_shader(self.folder / "hand", "lib/surface/frame.glsl", right, wrong)
                 )

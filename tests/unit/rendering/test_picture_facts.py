@@ -18,7 +18,7 @@ from btfref.rendering.picture import (
     read_picture_facts,
 )
 from btfref.representations import save
-from btfref.scene.files import scene_facts, scene_files
+from btfref.scene.facts import scene_facts, scene_files
 from btfref.stress.data import bumpy
 
 SIZE = (24, 24)
