@@ -22,11 +22,11 @@ STEP = 0.25
 #: llvmpipe follow it).
 SNAP = 0.5 / 256
 
-#: Angle, in radians, within which two renderers may give a sample to one or the other of two triangles that meet. Which
-#: one the rasterizer draws does not matter, since shaders follow the ray (``lib/surface/triangle_table.glsl``), so that
-#: rounding is left: positions at a distance of some units are good to 5e-7 of it in float32, barycentric coordinates of
-#: small triangles to a few times that.
-ROUNDING = 2e-6
+#: Angle, in radians, within which two renderers may give a sample to one or the other of two triangles that meet, over
+#: the cosine at which they are seen. Which one the rasterizer draws does not matter, since shaders follow the ray
+#: (``lib/surface/triangle_table.glsl``), so that rounding is left: positions at a distance of some units are good to
+#: 5e-7 of it in float32, in each renderer; a foreshortened triangle's determinant loses by its cosine.
+ROUNDING = 1e-6
 
 #: Step in depth, in pixels, between rays `SNAP` apart that is an edge: a smooth surface leaves its tangent plane by far
 #: less, unless it is seen at grazing.
