@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
+from unittest.mock import patch
 
 import numpy as np
 
@@ -184,16 +185,13 @@ class Bench:
         from btfref.validate.self_test import edited_shader
         from btfref.validate.witness.gates import testify
 
-        path, hand_of = self.fit(subject)[1], plugin.hand_of
         right, wrong = "dot(side, normal) < 0.0 ? -1.0 : 1.0", "1.0"
         with ExitStack() as faults:
             if change == "hand":
-                plugin.hand_of = lambda si: 1.0
-                faults.callback(setattr, plugin, "hand_of", hand_of)
-                faults.enter_context(
-                    edited_shader(self.folder / "hand", "lib/surface/frame.glsl", right, wrong)
-                )
-            found = testify(path)
+                faults.enter_context(patch.object(plugin, "hand_of", lambda si: 1.0))
+                folder = self.folder / "hand"
+                faults.enter_context(edited_shader(folder, "lib/surface/frame.glsl", right, wrong))
+            found = testify(self.fit(subject)[1])
         return [*found.gates(), *found.between()]
 
     def probes(self, subject: Subject) -> Gates:

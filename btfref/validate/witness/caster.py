@@ -55,7 +55,8 @@ class Lookups:
 
         ``some``, bool of shape (SIZE, SIZE), chooses pixels; the others stay black.
         """
-        at = slice(None) if some is None else np.flatnonzero(some.ravel()[self.pixel])
+        chosen = np.ones(len(self.pixel), bool) if some is None else some.ravel()[self.pixel]
+        at = np.flatnonzero(chosen)
         value = self.power[at] * evaluate(self.uv[at], self.w_light[at], self.w_view[at])
         sums = [np.bincount(self.pixel[at], value[:, c], SIZE * SIZE) for c in range(3)]
         return np.stack(sums, -1).reshape(SIZE, SIZE, 3)
