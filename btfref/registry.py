@@ -124,7 +124,9 @@ class Catalogue:
         InputError
             When there is none, or its package cannot be loaded.
         """
-        return imported(self.place(name))
+        if name in self.rows:
+            return imported(self.rows[name])
+        return self._of_a_package(name)[1]
 
     def place(self, name: str) -> str:
         """``"module:object"`` of that name.
@@ -132,13 +134,16 @@ class Catalogue:
         Raises
         ------
         InputError
-            When there is none.
+            As `load`.
         """
-        if name in self.rows:
-            return self.rows[name]
+        return self.rows[name] if name in self.rows else self._of_a_package(name)[0]
+
+    def _of_a_package(self, name: str) -> tuple[str, Any]:
+        """``"module:object"`` of another package's entry point, and the object."""
         found, broken = usable_points(self.group)
         if name in found:
-            return next(point.value for point in entry_points(group=self.group, name=name))
+            place = next(point.value for point in entry_points(group=self.group) if point.name == name)
+            return place, found[name]
         if name in broken:
             raise InputError(f"a {self.kind} of another package: {broken[name]}", field=self.kind)
         raise InputError(
@@ -423,7 +428,7 @@ def method(key: str, *, file: PathLike | None = None) -> Method:
     InputError
         When there is none.
     """
-    rows, broken = _all_methods()
+    rows, broken = methods(), _all_methods()[1]
     if key not in rows and key in broken:
         raise InputError(f"a method of another package: {broken[key]}", file=file, field="method")
     if key not in rows:

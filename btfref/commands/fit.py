@@ -87,13 +87,13 @@ def _say_between(method: str, facts: dict[str, float] | None, *, json: bool) -> 
     """How wrong the fit is between its samples; on standard error, what is beyond the stated limits."""
     import sys
 
-    from btfref.representations import between
+    from btfref.stress.between_samples import between_gates
 
     if facts is None:  # fitted to a part
         return
     if not json:
         emit("between the samples: " + ", ".join(f"{name} {number(facts[name])}" for name in facts))
-    beyond = [gate for gate in between.gates(method, facts) if not gate.passed]
+    beyond = [gate for gate in between_gates(method, facts) if not gate.passed]
     if beyond:
         found = ", ".join(
             f"{g.entry.removeprefix('min_')} {number(g.value)}, wanted {g.sign} {g.limit:g}" for g in beyond

@@ -12,6 +12,7 @@ import copy
 import difflib
 import functools
 import tomllib
+import warnings
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -99,10 +100,11 @@ def _gates() -> dict[str, Gate]:
             own = parse(file.read_text("utf-8"), file=str(file))
             if twice := sorted(own.keys() & gates.keys()):
                 raise InputError("gates that are there already", file=str(file), got=", ".join(twice))
-        except (InputError, OSError, ValueError):
+        except (InputError, OSError, ValueError) as error:
             # A package's own limits that cannot be used are missed by its method, and by no other.
             if shipped in Path(str(file)).resolve().parents:
                 raise
+            warnings.warn(f"limits of another package are left out: {error}", stacklevel=2)
             continue
         gates |= own
     return gates

@@ -7,20 +7,15 @@ highlights and is no truth itself; ``btfref bench between`` measures both agains
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from btfref.gates.tolerances import gate_keys, gate_table, limits
-from btfref.gates.verdicts import GateResult, judge
 from btfref.numerics.solvers.threads import reproducible
 from btfref.numerics.sphere.quadrature import gauss_hemisphere
 from btfref.representations.lookup import CHUNK
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from numpy.typing import ArrayLike
 
     from btfref.registry import Method
@@ -28,8 +23,6 @@ if TYPE_CHECKING:
     from btfref.sampling.sampled_btf import SampledBTF
     from btfref.types import Progress
 
-#: The gate that judges these figures.
-GATE = "fit.between_samples"
 
 #: Random lookups: 16 of them lie above the 99.9th percentile.
 LOOKUPS = 1 << 14
@@ -120,28 +113,6 @@ def measure(representation: Evaluates, btf: SampledBTF, *, seed: int = 0) -> dic
         "albedo_excess": float(albedo.max() / max(data_albedo.max(), 1.0)),
         "negative_fraction": float(np.mean(found < 0)),
     }
-
-
-def gates(method: str, facts: Mapping[str, float]) -> list[GateResult]:
-    """The limits of ``fit.between_samples``, and in their place those that a method brings, applied to the figures.
-
-    Parameters
-    ----------
-    method : str
-        Registry key.
-    facts : dict
-        Of :func:`measure`; what the gate does not limit is left out.
-
-    Returns
-    -------
-    list of GateResult
-    """
-    own = f"{GATE}.{method}"
-    key = own if own in gate_keys() else GATE
-    names = {entry.removeprefix("min_") for entry in limits(gate_table(key))}
-    found = judge(key, {name: facts[name] for name in facts.keys() & names})
-    # One name whoever's limits they are.
-    return [replace(gate, name=f"{GATE}.{gate.entry}") for gate in found]
 
 
 def interpolated(btf: SampledBTF, texel: np.ndarray, w_light: np.ndarray, w_view: np.ndarray) -> np.ndarray:

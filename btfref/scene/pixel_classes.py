@@ -22,11 +22,11 @@ STEP = 0.25
 #: llvmpipe follow it).
 SNAP = 0.5 / 256
 
-#: Angle, in radians, within which two renderers may give a sample to one or the other of two triangles that meet. Which
-#: one the rasterizer draws does not matter, since shaders follow the ray (``lib/surface/triangle_table.glsl``), so that
-#: rounding is left: positions at a distance of some units are good to 5e-7 of it in float32, barycentric coordinates of
-#: small triangles to a few times that.
-ROUNDING = 2e-6
+#: Angle, in radians, within which two renderers may give a sample to one or the other of two triangles that meet, over
+#: the cosine at which they are seen. Which one the rasterizer draws does not matter, since shaders follow the ray
+#: (``lib/surface/triangle_table.glsl``), so that rounding is left: positions at a distance of some units are good to
+#: 5e-7 of it in float32, in each renderer; a foreshortened triangle's determinant loses by its cosine.
+ROUNDING = 1e-6
 
 #: Step in depth, in pixels, between rays `SNAP` apart that is an edge: a smooth surface leaves its tangent plane by far
 #: less, unless it is seen at grazing.
@@ -179,6 +179,7 @@ def _hits(scene: JitArray, grid: int, angle: float) -> list[np.ndarray]:
         Where another renderer may see something else.
     """
     import drjit as dr
+    import mitsuba as mi
 
     sensor = scene.sensors()[0]
     width, height = (int(k) for k in sensor.film().crop_size())
@@ -195,19 +196,21 @@ def _hits(scene: JitArray, grid: int, angle: float) -> list[np.ndarray]:
     (ray, _), (beside, _) = (film_rays(sensor, (x, 0.5)) for x in (0.5, 1.5))
     pixel = dr.norm(ray.d - beside.d)
     dr.eval(pixel)
-    # Of a pixel, as the angle asks for; a finer triangle than that cannot be told from its neighbours.
-    rounding = min(SNAP, angle / float(np.array(pixel).min()))
     for number, offset in enumerate(offsets):
         seen = _seen(scene, offset)
         footprint = dr.select(seen["shape"] > 0, seen["distance"] * pixel, 0)
         ambiguous = (seen["shape"] > 0) & (dr.abs(seen["height"]) < HORIZON)
-        dr.eval(footprint, ambiguous)
+        # In pixels. Seen at grazing, a determinant loses by as much as the triangle is foreshortened.
+        rounding = dr.minimum(SNAP, dr.opaque(mi.Float, angle) / (pixel * dr.maximum(seen["facing"], 1e-6)))
+        dr.eval(footprint, ambiguous, rounding)
         # One ray after the other: all of them share one kernel, which is quick to compile.
         for x, y in ((-1, -1), (1, -1), (-1, 1), (1, 1)):
             snapped = _seen(scene, (offset[0] + x * SNAP, offset[1] + y * SNAP))
             ambiguous |= _seen_otherwise(seen, snapped, footprint)
             dr.eval(ambiguous)
-            near = _seen(scene, (offset[0] + x * rounding, offset[1] + y * rounding))
+            moved = offset[0] + x * rounding, offset[1] + y * rounding
+            dr.eval(moved)
+            near = _seen(scene, moved)
             ambiguous |= _in_another_frame(seen, near)
             dr.eval(ambiguous)
         values = {
@@ -227,18 +230,20 @@ def _hits(scene: JitArray, grid: int, angle: float) -> list[np.ndarray]:
     return [array.reshape(height * grid, width * grid, *array.shape[4:]) for array in made.values()]
 
 
-def _seen(scene: JitArray, offset: tuple[float, float]) -> dict[str, JitArray]:
+def _seen(scene: JitArray, offset: tuple[float | JitArray, float | JitArray]) -> dict[str, JitArray]:
     """What a point of every pixel sees, on the device: shape (0 for none), triangle, place, frame."""
     import drjit as dr
     import mitsuba as mi
 
-    si = scene.ray_intersect(film_rays(scene.sensors()[0], offset)[0])
+    ray, _ = film_rays(scene.sensors()[0], offset)
+    si = scene.ray_intersect(ray)
     seen = {
         "shape": dr.select(si.is_valid(), dr.reinterpret_array(mi.UInt32, si.shape), 0),
         "triangle": si.prim_index,
         "distance": si.t,
         "point": si.p,
         "normal": si.n,
+        "facing": dr.abs(dr.dot(si.n, ray.d)),
         "height": si.wi.z,
         "tangent": si.sh_frame.s,
         "shading": si.sh_frame.n,

@@ -1,5 +1,7 @@
 """Which way a texture runs: pictures in the mirror, degenerate coordinates, and what is said of mirrored ones."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
@@ -62,34 +64,46 @@ def same(image, expected):
     return np.abs(image - expected).max() <= tolerance("mirror.symmetry.max") * np.abs(expected).max()
 
 
-@pytest.mark.parametrize("renderer", RENDERERS)
-@pytest.mark.parametrize(
-    "key", [pytest.param(k, marks=[] if k == FIRST else pytest.mark.long) for k in methods()]
-)
-def test_a_mirrored_texture_in_mirrored_light_is_the_mirrored_picture(llvm, fits, tmp_path, key, renderer):
+#: How a texture is mirrored: by its coordinates, by the material, by the transform of the shape; or twice.
+WAYS = ("coordinates", "material", "shape", "twice")
+
+#: In the default run one method is mirrored by its coordinates in all three ways to draw, and by the material in one.
+DEFAULT = {(FIRST, renderer, "coordinates") for renderer in RENDERERS} | {(FIRST, "GLSL", "material")}
+
+CASES = [
+    pytest.param(*case, marks=[] if case in DEFAULT else pytest.mark.long)
+    for case in product(methods(), RENDERERS, WAYS)
+]
+
+
+@pytest.mark.parametrize(("key", "renderer", "way"), CASES)
+def test_a_mirrored_texture_in_mirrored_light_is_the_mirrored_picture(
+    llvm, fits, tmp_path, key, renderer, way
+):
     """The square and the camera are their own mirror images, so that this holds without any renderer's word for it."""
     llvm.set_variant("scalar_rgb")
     draw, btf, transform = RENDERERS[renderer], fits.path(key), llvm.ScalarTransform4f
-    straight, mirrored = (
-        write_square(tmp_path / f"{name}.obj", corners)
-        for name, corners in (("straight", STRAIGHT), ("mirrored", MIRRORED))
-    )
-    turned_over = transform().translate([1, 0, 0]).scale([-1, 1, 1])
+    straight = write_square(tmp_path / "straight.obj", STRAIGHT)
+    path = write_square(tmp_path / "other.obj", MIRRORED if way in ("coordinates", "twice") else STRAIGHT)
+    settings = {}
+    if way in ("material", "twice"):
+        settings["to_uv"] = transform().translate([1, 0, 0]).scale([-1, 1, 1])
+    if way == "shape":
+        settings["to_world"] = transform().scale([-1, 1, 1])
     picture = draw(square(llvm, btf, straight)).image
-    expected = picture[:, ::-1]
     assert picture.max() > tolerance("rendered.subject.min_peak")
-    # The light tells left from right: a picture that is merely mirrored is another one.
-    assert not same(draw(square(llvm, btf, straight, side=-1)).image, expected)
-    # Mirrored by its own coordinates, by the material, and by the transform of the shape.
-    assert same(draw(square(llvm, btf, mirrored, side=-1)).image, expected)
-    assert same(draw(square(llvm, btf, straight, side=-1, to_uv=turned_over)).image, expected)
-    in_space = {"to_world": transform().scale([-1, 1, 1])}
-    assert same(draw(square(llvm, btf, straight, side=-1, **in_space)).image, expected)
-    # Mirrored twice it is as it was.
-    assert same(draw(square(llvm, btf, mirrored, to_uv=turned_over)).image, picture)
+    if way == "twice":
+        assert same(draw(square(llvm, btf, path, **settings)).image, picture)
+        return
+    expected = picture[:, ::-1]
+    assert same(draw(square(llvm, btf, path, side=-1, **settings)).image, expected)
+    if way == "coordinates":
+        # The light tells left from right: a picture that is merely lit from there is another one.
+        assert not same(draw(square(llvm, btf, straight, side=-1)).image, expected)
 
 
-@pytest.mark.parametrize("draw", [realtime, pytest.param(approximate, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("draw", [realtime, approximate])
 @pytest.mark.parametrize("way", ["sh", "transfer"])
 def test_environments_in_the_mirror(llvm, fits, tmp_path, way, draw):
     """Seen from both sides: a mirrored frame is not the frame of a back."""
@@ -139,11 +153,10 @@ def test_render_says_once_that_a_texture_is_mirrored(llvm, fits, tmp_path, capsy
     <boolean name="flip_tex_coords" value="$flip"/><bsdf type="twosided"><bsdf type="btf">
     <string name="filename" value="{}"/></bsdf></bsdf></shape><emitter type="directional"/></scene>"""
     (tmp_path / "scene.xml").write_text(text.format(fits.path(FIRST)))
-    for command in ("render", "realtime"):
-        for flip, count in (("true", 1), ("false", 0)):
-            capsys.readouterr()
-            arguments = [command, str(tmp_path / "scene.xml"), "-o", str(tmp_path / f"{command}.exr")]
-            assert main([*arguments, "--grid", "1", "-D", f"flip={flip}"]) == 0
-            said = [line for line in capsys.readouterr().out.splitlines() if "mirrored" in line]
-            assert len(said) == count
-            assert all("floor" in line and "flip_tex_coords" in line and "to_uv" in line for line in said)
+    for command, flip, count in (("render", "true", 1), ("render", "false", 0), ("realtime", "true", 1)):
+        capsys.readouterr()
+        arguments = [command, str(tmp_path / "scene.xml"), "-o", str(tmp_path / f"{command}.exr")]
+        assert main([*arguments, "--grid", "1", "-D", f"flip={flip}"]) == 0
+        said = [line for line in capsys.readouterr().out.splitlines() if "mirrored" in line]
+        assert len(said) == count
+        assert all("floor" in line and "flip_tex_coords" in line and "to_uv" in line for line in said)

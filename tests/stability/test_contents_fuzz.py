@@ -27,7 +27,7 @@ def check(folder, cases, mode):
     assert not failures, "\n".join(failures[:20])
     # Neither verdict proves anything where the other one never comes.
     assert counts["refused"] > cases // 4
-    assert counts["taken"] > cases // 100
+    assert counts["taken"] > 0
 
 
 def test_hostile_contents(bases):

@@ -47,7 +47,7 @@ def emit(text: str = "", *, flush: bool = False, coloured: bool = False) -> None
 
 def emit_json(data: object) -> None:
     """Write `data` to standard output as indented JSON."""
-    utf8 = (getattr(sys.stdout, "encoding", None) or "utf-8").lower().replace("-", "") == "utf8"
+    utf8 = (getattr(stdout(), "encoding", None) or "utf-8").lower().replace("-", "") == "utf8"
     text = json.dumps(data, indent=2, ensure_ascii=not utf8, default=_plain)
     # Controls that JSON leaves as they are stand in strings alone.
     emit(_CONTROLS.sub(lambda found: f"\\u{ord(found[0]):04x}" if found[0] != "\r" else found[0], text))

@@ -322,10 +322,14 @@ def _check_rings(check: _Check, name: str, rings: np.ndarray, vectors: np.ndarra
     theta, phi, counts, starts = rings.T
     if (counts < 1).any() or (counts != np.floor(counts)).any() or counts.sum() != len(vectors):
         check.refuse(name, counts.tolist(), f"counts of {len(vectors)} directions", damaged)
-    if counts[0] != 1 or (starts != np.cumsum([0, *counts[:-1]])).any():
-        check.refuse(name, starts.tolist(), "the pole first, then ring after ring", damaged)
-    if theta[0] != 0 or phi[0] != 0 or (np.diff(theta) <= 0).any() or (np.abs(phi) > 7).any():
-        check.refuse(name, theta.tolist(), "polar angles from 0 on, rising", damaged)
+    if (starts != np.cumsum([0, *counts[:-1]])).any():
+        check.refuse(name, starts.tolist(), "ring after ring", damaged)
+    # A first ring of one sample is the pole; one of more leaves a cap inside, whose polygon holds the pole.
+    pole = counts[0] == 1
+    if (theta[0] != 0 or phi[0] != 0) if pole else (theta[0] <= 0 or counts[0] < 3):
+        check.refuse(name, [theta[0], counts[0]], "the pole, or a ring of three samples or more", damaged)
+    if (np.diff(theta) <= 0).any() or (np.abs(phi) > 7).any():
+        check.refuse(name, theta.tolist(), "polar angles that rise", damaged)
     ring = np.repeat(np.arange(len(rings)), counts.astype(int))
     turn = (np.arange(len(vectors)) - starts[ring]) / counts[ring]
     off = np.abs(spherical(theta[ring], phi[ring] + 2 * np.pi * turn) - vectors)

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from btfref.conventions import PixelClass
 from btfref.gates.verdicts import GateResult, Measured, judge
 from btfref.images.display import fit_display
 from btfref.scene.shipped import scene_file
+from btfref.stress.between_samples import between_gates
 from btfref.stress.data import bumpy
 from btfref.stress.evaluators import DEFINITION, PORTS, DrJit, evaluator
 from btfref.stress.judging import port_agreement
@@ -230,17 +232,13 @@ class Bench:
         from btfref.validate.self_test import edited_shader
         from btfref.validate.witness.gates import testify
 
-        path, names = self.fit(subject)[1], vars(plugin)
-        hand_of = names["hand_of"]
         right, wrong = "dot(side, normal) < 0.0 ? -1.0 : 1.0", "1.0"
         with ExitStack() as faults:
             if change == "hand":
-                names["hand_of"] = lambda si: 1.0
-                faults.callback(names.__setitem__, "hand_of", hand_of)
-                faults.enter_context(
-                    edited_shader(self.folder / "hand", "lib/surface/frame.glsl", right, wrong)
-                )
-            found = testify(path)
+                faults.enter_context(patch.object(plugin, "hand_of", lambda si: 1.0))
+                folder = self.folder / "hand"
+                faults.enter_context(edited_shader(folder, "lib/surface/frame.glsl", right, wrong))
+            found = testify(self.fit(subject)[1])
         return [*found.gates(), *found.between()]
 
     def between(self, subject: Subject, change: str = "") -> Gates:
@@ -253,7 +251,7 @@ class Bench:
         free: Facts = {"between": 0.0, "sweeps": 60} if change == "free" else {}
         fitted = row(key).fit(rough, **dict(parameters), **free)
         off = Off(fitted, OFF.get(change, 1.0))
-        return between.gates(key, between.measure(off, rough))
+        return between_gates(key, between.measure(off, rough))
 
     def probes(self, subject: Subject) -> Gates:
         """The shader against the definition, at all levels of detail where there are any."""

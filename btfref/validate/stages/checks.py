@@ -48,8 +48,8 @@ def make_checks(cache: Cache, mesostructure: str, method: str, settings: Setting
 
 def _measured(cache: Cache, mesostructure: str, key: str, settings: Settings) -> Facts:
     from btfref.registry import method
-    from btfref.representations import between
     from btfref.representations.file.container import read_info
+    from btfref.stress.between_samples import between_gates
     from btfref.validate.method_gates import probe_gates, sampling_gates
     from btfref.validate.witness.gates import testify
 
@@ -58,7 +58,7 @@ def _measured(cache: Cache, mesostructure: str, key: str, settings: Settings) ->
     gates = [*probe_gates(file), *testify(file).gates()]
     gates += sampling_gates(file, samples=settings.chi2_samples, intervals=settings.chi2_intervals)
     info = read_info(file)
-    gates += between.gates(key, info["fit"].get("between_samples", {}))
+    gates += between_gates(key, info["fit"].get("between_samples", {}))
     btf = load_material(make_material(cache, mesostructure, settings)[0])
     error = held_out_error(method(key).fit, btf, texels=settings.held_out_texels)
     return json_safe(

@@ -50,10 +50,15 @@ class Lookups:
     pixel: np.ndarray
     sure: np.ndarray
 
-    def picture(self, evaluate: Callable[..., np.ndarray]) -> np.ndarray:
-        """Radiance, shape (SIZE, SIZE, 3): sums of ``power · evaluate(uv, w_light, w_view)``."""
-        value = self.power * evaluate(self.uv, self.w_light, self.w_view)
-        sums = [np.bincount(self.pixel, value[:, c], SIZE * SIZE) for c in range(3)]
+    def picture(self, evaluate: Callable[..., np.ndarray], some: np.ndarray | None = None) -> np.ndarray:
+        """Radiance, shape (SIZE, SIZE, 3): sums of ``power · evaluate(uv, w_light, w_view)``.
+
+        ``some``, bool of shape (SIZE, SIZE), chooses pixels; the others stay black.
+        """
+        chosen = np.ones(len(self.pixel), bool) if some is None else some.ravel()[self.pixel]
+        at = np.flatnonzero(chosen)
+        value = self.power[at] * evaluate(self.uv[at], self.w_light[at], self.w_view[at])
+        sums = [np.bincount(self.pixel[at], value[:, c], SIZE * SIZE) for c in range(3)]
         return np.stack(sums, -1).reshape(SIZE, SIZE, 3)
 
 

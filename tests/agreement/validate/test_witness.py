@@ -4,7 +4,7 @@ import pytest
 
 from btfref.gates import tolerance
 from btfref.registry import methods
-from btfref.validate.witness.gates import testify
+from btfref.validate.witness import gates as witness
 from btfref.validate.witness.scene import SIZE
 
 pytestmark = pytest.mark.usefixtures("renderers")
@@ -13,7 +13,7 @@ pytestmark = pytest.mark.usefixtures("renderers")
 @pytest.mark.long
 @pytest.mark.parametrize("key", methods())
 def test_both_renderers_are_as_the_witness_says(fits, key):
-    found = testify(fits.path(key))
+    found = witness.testify(fits.path(key))
     gates = found.gates()
     assert {gate.detail for gate in gates} == {"Mitsuba", "OpenGL"}
     assert [gate.line for gate in gates if not gate.passed] == []

@@ -14,6 +14,7 @@ from btfref.registry import methods
 from btfref.representations import between, load
 from btfref.representations.analytic import lafortune, lafortune_lut
 from btfref.sampling import SampledBTF
+from btfref.stress.between_samples import between_gates
 
 EXACT = tolerance("interpolation.exact.max")
 
@@ -46,7 +47,7 @@ def test_the_interpolation_differs_from_itself_by_nothing():
         assert 0 < facts["peak_p999"] < facts["peak"] <= 1 + EXACT
         assert facts["albedo_excess"] == facts["albedo"] / max(facts["data_albedo"], 1)
         assert facts["negative_fraction"] == 0
-        assert all(gate.passed for gate in between.gates("raw", facts))
+        assert all(gate.passed for gate in between_gates("raw", facts))
 
 
 def test_a_wall_has_its_albedo():
@@ -73,8 +74,8 @@ def test_what_is_wrong_is_measured_and_fails_its_limit(change, measured, entry):
     name, value = measured
     scale = right["peak"] if name == "peak" else 1
     assert abs(wrong[name] / (scale * value) - 1) <= tolerance("between.albedo.relative")
-    assert [gate.entry for gate in between.gates("raw", right) if not gate.passed] == []
-    assert entry in [gate.entry for gate in between.gates("raw", wrong) if not gate.passed]
+    assert [gate.entry for gate in between_gates("raw", right) if not gate.passed] == []
+    assert entry in [gate.entry for gate in between_gates("raw", wrong) if not gate.passed]
 
 
 def test_a_fit_states_it_and_is_otherwise_as_it_was():

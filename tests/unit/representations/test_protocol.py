@@ -23,6 +23,7 @@ REPRESENTATIONS = {
     "SharesTables": {"lpca"},
     "LitByHarmonics": {"lpca"},
     "LitByTransfer": {"lpca"},
+    "HasSchema": set(methods()),
 }
 
 #: Likewise of fit modules.
