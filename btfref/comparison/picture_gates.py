@@ -51,7 +51,7 @@ def judge_pictures(key: str, comparison: Comparison, masks: Mapping[str, np.ndar
     if wanted == ["judged_share"]:
         # Edges inside a material have a class and a gate of their own.
         smooth = covered & (comparison.classes != PixelClass.MESOSTRUCTURE)
-        share = np.count_nonzero(mask & smooth) / max(np.count_nonzero(smooth), 1)
+        share = int(np.count_nonzero(mask & smooth)) / max(int(np.count_nonzero(smooth)), 1)
         return judge(key, {"judged_share": share}, pixel_class=name)
     if wanted == ["nonfinite"]:
         bad = {side: comparison.counts[f"nonfinite_{side}"] for side in ("test", "reference")}

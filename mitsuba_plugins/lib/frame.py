@@ -23,5 +23,7 @@ def hand_of(si: JitArray) -> JitArray:
     mitsuba.Float
         By it Mitsuba's second tangent ``n × s`` becomes one that follows the texture. 1 where there are no derivatives.
     """
+    if not dr.width(si.dp_du):  # a place that somebody made up, without derivatives
+        return mi.Float(1)
     area = dr.cross(si.dp_du, si.dp_dv)
     return dr.select(dr.dot(area, si.sh_frame.n) < 0, mi.Float(-1), mi.Float(1))

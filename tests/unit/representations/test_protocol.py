@@ -89,7 +89,10 @@ def test_a_method_from_outside_derives_from_nothing_and_satisfies_them(monkeypat
     try:
         row = import_module("tinted_brdf").METHOD
         made = row.fit(oracle_btf((4, 4)))
-        assert satisfied(made, protocol, ["Representation", *REPRESENTATIONS]) == {"Representation"}
+        assert satisfied(made, protocol, ["Representation", *REPRESENTATIONS]) == {
+            "Representation",
+            "HasSchema",
+        }
         assert satisfied(row.fitting, protocol, MODULES) == {"FitModule"}
         evaluator = import_module(row.plugin).Evaluator
         assert satisfied(evaluator, ports, EVALUATORS) == {"Evaluator"}
