@@ -34,8 +34,6 @@ GATES = {
 #: In the default run.
 QUICK = {
     ("lpca", "cloth", "bright-texel"),
-    ("cmf", "sphere", "bright-texel"),
-    ("rf_poly", "plane", "bright-texel"),
     ("rf_lobes", "sphere", "bright-texel"),
 }
 

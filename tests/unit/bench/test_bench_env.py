@@ -7,8 +7,12 @@ from btfref.bench.options import Options
 from btfref.gates import tolerance
 
 
-def test_transfer_table_and_plot(need, tmp_path):
+def test_transfer_table_and_plot(need, monkeypatch):
     need("llvm"), need("gl")
+    # Every other of these is taken by the quick run.
+    monkeypatch.setattr(env, "CLUSTERS", (4, 16, 64))
+    monkeypatch.setattr(env, "COMPONENTS", (8,))
+    monkeypatch.setattr(env, "MAP_SIZES", (8,))
     result = env.run(Options(quick=True, btf=oracle_btf((8, 8)), only=("transfer",)))
     rows = result["summary"]["transfer"]
     by_setting = {(r["matrix_clusters"], r["matrix_components"], r["bits"]): r for r in rows}
