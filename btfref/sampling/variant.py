@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
@@ -43,6 +44,9 @@ def mitsuba_variant(variant: str) -> Iterator[ModuleType]:
         )
     previous = mi.variant()
     set_variant(variant)
+    if "mitsuba_plugins" in sys.modules:
+        # Materials in Python that nobody holds any longer go now: freed in the middle of a trace they are a crash.
+        gc.collect()
     try:
         yield mi
     finally:

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from btfref.errors import InputError
+from btfref.sampling.variant import no_collection
 from btfref.scene import parsing
 from btfref.types import JitArray, SceneLike
 
@@ -44,6 +45,7 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
     ) -> None:
         self._arguments = scene, parameters, variant, size, plain, kept, sampled
         self._before = None
+        self._uncollected = no_collection()
 
     def __enter__(self) -> JitArray:
         scene, parameters, variant, size, plain, kept, sampled = self._arguments
@@ -55,6 +57,7 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
 
         self._before = mi.variant()
         parsing.use_variant(variant)
+        self._uncollected.__enter__()  # what is traced in the block sees no material go
         try:
             if "scalar" not in variant:
                 import mitsuba_plugins
@@ -87,6 +90,7 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
             raise
 
     def __exit__(self, *_: object) -> None:
+        self._uncollected.__exit__(None, None, None)
         if self._before is not None:
             parsing.use_variant(self._before)
 

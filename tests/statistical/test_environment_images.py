@@ -5,6 +5,7 @@ the pictures, and the same sub-pixel positions, so that what is left is the appr
 """
 
 import gc
+import weakref
 
 import numpy as np
 import pytest
@@ -117,6 +118,27 @@ def test_no_garbage_is_collected_while_kernels_are_traced(fits, monkeypatch):
     render(scene_file("plane"), parameters=parameters, spp=2, size=(4, 4))
     assert seen == [False]
     assert gc.isenabled()
+
+
+def test_dead_materials_are_gone_before_anything_is_traced(fits, llvm):
+    """They hang in cycles with their scenes, and only a collection frees them."""
+    import mitsuba_plugins
+    from btfref.sampling.variant import mitsuba_variant
+
+    class Scene:
+        pass
+
+    scene = Scene()
+    scene.itself, scene.material = scene, mitsuba_plugins.load(fits.path("rf_poly"))
+    alive = weakref.ref(scene)
+    gc.disable()
+    try:
+        del scene
+        assert alive() is not None
+        with mitsuba_variant("llvm_ad_rgb"):
+            assert alive() is None
+    finally:
+        gc.enable()
 
 
 def test_tiles_have_three_outcomes(rng):

@@ -103,7 +103,7 @@ def render_geometry(
 
     from btfref.mesostructure.tiling import tiled_shapes
     from btfref.provenance import versions
-    from btfref.sampling.variant import mitsuba_variant
+    from btfref.sampling.variant import mitsuba_variant, no_collection
 
     if not isinstance(spp, int | np.integer) or spp < 2:
         raise InputError("samples per pixel", field="spp", got=spp, expected="a whole number, at least 2")
@@ -114,7 +114,7 @@ def render_geometry(
     depth = parent.get("max_depth", 8) if max_depth is None else max_depth
     rounds = int(min(ROUNDS, spp // 2)) if spp >= 4 else 2
     start = time.perf_counter()
-    with mitsuba_variant(variant) as mi:
+    with mitsuba_variant(variant) as mi, no_collection():
         # Whatever sticks out of its tile belongs to the neighbours as well.
         low = np.floor(plane.low - geometry.overhang + _SLACK).astype(int)
         high = np.ceil(plane.high + geometry.overhang - _SLACK).astype(int)
