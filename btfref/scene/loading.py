@@ -29,7 +29,8 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
 
     ``plain`` loads the shapes alone: materials become diffuse, and BTF files need not exist. ``kept`` says which
     maps are loaded: file to the materials' parameters ``views``, ``lights``, ``entries`` and ``levels``. Without
-    ``sampled`` nobody draws light directions, and materials are spared the tables for it.
+    ``sampled`` nobody draws light directions, and materials are spared the tables for it; None: where all lights are
+    delta lights.
     """
 
     def __init__(
@@ -41,7 +42,7 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
         size: tuple[int, int] | None = None,
         plain: bool = False,
         kept: Kept | None = None,
-        sampled: bool = True,
+        sampled: bool | None = True,
     ) -> None:
         self._arguments = scene, parameters, variant, size, plain, kept, sampled
         self._before = None
@@ -69,6 +70,9 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
             btf_shapes = _btf_shapes(parsed)
             if plain:
                 parsing.plain(parsed)
+            if sampled is None:
+                lights = [node for node in parsed.nodes if parsing.is_kind(node, "Emitter")]
+                sampled = any(node.props.plugin_name() not in parsing.DELTA_LIGHTS for node in lights)
             for node in parsed.nodes:
                 if node.props.plugin_name() != parsing.BTF:
                     continue

@@ -105,6 +105,25 @@ def test_the_reference_without_shadows_is_unbiased(fits):
     assert abs(z.mean()) * np.sqrt(z.size) < 5
 
 
+@pytest.mark.parametrize(
+    ("lights", "more", "drawn"),
+    [
+        ("directional1", {}, "cosine"),
+        ("directional1", {"with_variance": True}, "data"),
+        ("constant", {}, "data"),
+    ],
+)
+def test_a_grid_draws_by_the_data_where_it_draws(fits, monkeypatch, lights, more, drawn):
+    """Tables to draw by are left out under delta lights alone: without them an environment is all noise."""
+    from mitsuba_plugins import base
+
+    seen, guide = [], base.LightGuide
+    monkeypatch.setattr(base, "LightGuide", lambda *given: seen.append(given[-1]) or guide(*given))
+    parameters = {"btf": str(fits.path("lpca")), "lights": lights}
+    render(scene_file("plane"), parameters=parameters, grid=1, spp=4, size=(8, 8), **more)
+    assert seen == [drawn]
+
+
 def test_no_garbage_is_collected_while_kernels_are_traced(fits, monkeypatch):
     """A material in Python that a collection frees in the middle of Dr.Jit's list of materials is a crash."""
     from btfref.rendering.offline import reference

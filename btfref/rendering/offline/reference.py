@@ -97,8 +97,8 @@ def render(
     kept = kept_maps(
         keep, scene, parameters, lights=grid is not None, grid=grid or 4, size=size, margin=margin
     )
-    # On a grid without random lights there are delta lights alone, and materials are only evaluated.
-    sampled = grid is None or with_variance
+    # On a grid, materials under delta lights alone are only evaluated, unless random lights are asked for.
+    sampled = True if grid is None or with_variance else None
     with loaded(scene, parameters, variant=variant, size=size, kept=kept, sampled=sampled) as made:
         found = traced(made, spp=spp, seed=seed, grid=grid, shadows=shadows, with_variance=with_variance)
         if not variant.startswith("scalar"):
