@@ -286,7 +286,8 @@ def _hits(
         )
         found = scene.ray_intersect_preliminary(ray)
         which = [np.array(found.is_valid() & (found.shape == mi.ShapePtr(s))) for s in shapes]
-        prim, uv = np.array(found.prim_index), np.array(found.prim_uv, float).T
+        # Of rays that meet nothing they are whatever memory held: only those of hits are numbers.
+        prim, uv = np.array(found.prim_index), np.array(found.prim_uv).T
         dr.eval(found)
         for number, hit in enumerate(which):
             at = np.flatnonzero(hit)
@@ -296,7 +297,7 @@ def _hits(
             faces = other.faces[prim[at]]
             row, column = first + at // len(w), at % len(w)
             vertex[row, column] = starts[number] + faces
-            u, v = uv[at].T
+            u, v = uv[at].T.astype(float)
             weight[row, column] = np.stack([1 - u - v, u, v], -1)
             normal = vertex_normals(other)[faces].sum(1)
             side[row, column] = (normal * w[column]).sum(1) > 0

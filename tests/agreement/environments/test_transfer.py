@@ -11,7 +11,7 @@ from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
 from btfref.numerics.sphere import harmonics
 from btfref.numerics.sphere.quadrature import gauss_hemisphere
-from btfref.rendering.environment_light import transfer_light
+from btfref.rendering.environment_light import transfer, transfer_light
 from btfref.rendering.environment_light.lighting import lighting_of
 from btfref.rendering.environment_light.transfer import (
     TransferSettings,
@@ -85,6 +85,29 @@ def test_nothing_hidden_is_the_rotation(fits):
     scene = described(fits, "plane")
     (found,) = vertex_transfer(scene.meshes, 4)
     np.testing.assert_array_equal(found, np.broadcast_to(np.eye(16, dtype=np.float32), found.shape))
+
+
+def test_what_misses_leave_in_memory_is_not_read(fits, llvm):
+    """Mitsuba writes no coordinates where a ray meets nothing; a signalling NaN there is an error to look at."""
+    import drjit as dr
+
+    mi, mesh = llvm, described(fits, "plane").meshes[0]
+
+    class Littered:
+        def __init__(self):
+            self.scene = mi.load_dict({"type": "scene", "mesh": transfer._mitsuba_mesh(mi, mesh, 0)})
+            self.shapes = self.scene.shapes
+
+        def ray_intersect_preliminary(self, ray):
+            found = self.scene.ray_intersect_preliminary(ray)
+            garbage = dr.reinterpret_array(mi.Float, dr.opaque(mi.UInt32, 0x7FA00000, dr.width(found.t)))
+            found.prim_uv = dr.select(found.is_valid(), found.prim_uv, mi.Point2f(garbage, garbage))
+            return found
+
+    w = np.array([[0, 0, 1.0], [0.6, 0, 0.8]])
+    vertex, weight, _ = transfer._hits(mi, Littered(), mesh, [mesh], np.array([0]), w, 1e-4)
+    assert (vertex == -1).all()
+    assert not weight.any()
 
 
 def test_a_closed_surface_hides_the_half_behind_it(fits):
