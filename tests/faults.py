@@ -123,16 +123,16 @@ def points(**found):
 
         class Point:
             dist = None
-            group = registry.ENTRY_POINT_GROUP
+            group = registry.points.ENTRY_POINT_GROUP
 
             def __init__(self, name, load):
                 self.name, self.value, self.load = name, f"{name}:ROW", load
 
         def entry_points(*, group, name=None):
-            return [Point(n, load) for n, load in found.items() if group == registry.ENTRY_POINT_GROUP]
+            return [Point(n, load) for n, load in found.items() if group == registry.points.ENTRY_POINT_GROUP]
 
-        patch.setattr(registry, "entry_points", entry_points)
-        for cached in (registry.usable_points, registry.methods, registry._all_methods):
+        patch.setattr(registry.points, "entry_points", entry_points)
+        for cached in (registry.points.usable_points, registry.methods, registry._all_methods):
             cached.cache_clear()
 
     return prepare

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from btfref.commands.shared.options import add_json
+from btfref.commands.shared.options import add_json, add_memory
 from btfref.commands.shared.printing import Progress, emit, emit_json, number
 from btfref.commands.shared.reading import assignments, count, number_above, output_file
 from btfref.errors import InputError
@@ -62,6 +62,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     bonn.add_argument("--error", type=number_above(0), metavar="E", help="relative RMS error that decides K")
     bonn.add_argument("--colour-model", type=int, choices=(0, 11), help="0: RGB (default), 11: as UBO2014")
     bonn.add_argument("--scalar", type=int, choices=(2, 4), help="bytes of a factor (default 2)")
+    add_memory(parser)
     add_json(parser, "what was written")
 
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from btfref.commands.shared.options import add_dtype, add_json
+from btfref.commands.shared.options import add_dtype, add_json, add_memory
 from btfref.commands.shared.printing import Progress, bytes_text, emit, emit_json, write_representation
-from btfref.commands.shared.reading import count, direction_set, number_above, output_file
+from btfref.commands.shared.reading import direction_set, number_above, output_file
 
 #: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
 OUTPUTS = {"output": ""}
@@ -47,7 +47,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument("--lights", metavar="SET", help="likewise")
     add_dtype(parser)
-    parser.add_argument("--memory", type=count(1), default=2048, metavar="MIB", help="to use (default 2048)")
+    add_memory(parser)
     parser.add_argument("--overwrite", action="store_true", help="replace a store of other settings")
     add_json(parser, "the facts of the store")
 
@@ -59,6 +59,7 @@ def run(args: Namespace) -> int:
     out = output_file(args.output, ".btf.zarr")
 
     from btfref.formats.convert import import_btf
+    from btfref.sampling import memory
 
     with Progress() as progress:
         store = import_btf(
@@ -70,14 +71,14 @@ def run(args: Namespace) -> int:
             cosine=args.cosine,
             scale=args.scale,
             rows=args.rows,
-            memory=args.memory << 20,
+            memory=memory.beside_the_interpreter(args.memory),
             progress=progress,
             allow_missing=args.allow_missing or None,
             gamma=args.gamma,
             views=args.views and direction_set(args.views),
             lights=args.lights and direction_set(args.lights),
         )
-    info = store.info()
+    info = store.info() | {"peak_memory_bytes": memory.peak()}
     if args.json:
         emit_json(info)
         return 0
@@ -85,6 +86,7 @@ def run(args: Namespace) -> int:
     emit(
         f"{out}: {' × '.join(map(str, info['shape']))} from {parent['format']}, {bytes_text(info['file_bytes'])}"
     )
+    emit(f"largest memory of the process: {bytes_text(info['peak_memory_bytes'])}")
     if parent["images_missing"]:
         emit(f"  {parent['images_missing']} images are missing: {info['coverage']:.2%} of it there")
     if parent["lights_moved"]:

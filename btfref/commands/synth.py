@@ -18,13 +18,12 @@ import operator
 from argparse import ArgumentParser, Namespace
 
 from btfref.commands.demand import add_scene_arguments, union, whole_shape
-from btfref.commands.shared.options import add_dtype, add_json, add_seed
+from btfref.commands.shared.options import add_dtype, add_json, add_memory, add_seed
 from btfref.commands.shared.printing import Progress, bytes_text, emit, emit_json
 from btfref.commands.shared.reading import (
     assignments,
     count,
     direction_set,
-    memory_size,
     number_above,
     numbers_or_file,
     output_file,
@@ -141,11 +140,9 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="scene file or shipped scene; several need what any of them needs",
     )
     add_scene_arguments(needs)
-    parser.add_argument(
-        "--memory",
-        type=memory_size,
-        metavar="SIZE",
-        help="budget, e.g. 2G, of all processes together, or of each worker at an address (default: half of "
+    add_memory(
+        parser,
+        "budget, e.g. 2G, of all processes together, or of each worker at an address (default: half of "
         "the machine's); without influence on the result",
     )
     parser.add_argument(

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from btfref.errors import BtfrefError, InputError
-from btfref.registry import Catalogue
+from btfref.registry.points import Catalogue
 from btfref.types import Facts, PathLike
 
 if TYPE_CHECKING:

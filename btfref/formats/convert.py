@@ -176,6 +176,8 @@ def _fill(
             store.write_view(view, values)
         else:
             store.write_part(view, np.flatnonzero(present), every, values[present])
+        if source.release is not None:
+            source.release()
         done += 1
         if progress is not None:
             progress(done, len(views), "import")

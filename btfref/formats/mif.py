@@ -100,6 +100,7 @@ def open_mif(path: PathLike, *, allow_missing: bool = False) -> Source:
         present=found.present,
         moved=found.moved,
         fingerprint=reader.digest,
+        release=reader.release,
     )
 
 

@@ -63,6 +63,10 @@ class Source:
     fingerprint : callable or str
         ``() -> str``: changes with the content, every byte of it; a resumed run checks it. Asked by conversions alone,
         since it reads the whole. Archives have checksums of their files already.
+    release : callable, optional
+        Gives back what memory the file takes without being asked for, after each view.
+    memory : int
+        Bytes that a conversion may hold at a time.
     """
 
     path: Path
@@ -77,6 +81,7 @@ class Source:
     present: np.ndarray = field(default_factory=lambda: np.array(True))
     moved: dict[tuple[int, int], tuple[float, float]] = field(default_factory=dict)
     fingerprint: Callable[[], str] | str = ""
+    release: Callable[[], None] | None = None
     memory: int = MEMORY
 
     def __post_init__(self) -> None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from btfref.errors import InputError
 from btfref.mesostructure.base import Mesostructure, Part
-from btfref.registry import Catalogue
+from btfref.registry.points import Catalogue
 
 if TYPE_CHECKING:
     from btfref.types import PathLike

@@ -15,7 +15,7 @@ from btfref.errors import BtfrefError, InputError
 from btfref.mesostructure import build
 from btfref.mesostructure.materials import load_bsdf
 from btfref.provenance import LLVM, versions
-from btfref.registry import imported
+from btfref.registry.points import imported
 from btfref.sampling.fallback import reason_against_surface
 from btfref.sampling.paths import adaptive
 from btfref.sampling.scheduling import run

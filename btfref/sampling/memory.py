@@ -54,6 +54,34 @@ class Blocks:
     lights: int
 
 
+#: Bytes of a process that converts or fits, before it holds anything: interpreter, NumPy, SciPy, Zarr, OpenEXR.
+CONVERSION_BASE = 160 << 20
+
+
+def beside_the_interpreter(budget: int | None) -> int:
+    """What of a budget is left for a BTF that is converted or fitted.
+
+    Parameters
+    ----------
+    budget : int or None
+        Bytes of the whole process; by default half of the machine's memory.
+
+    Returns
+    -------
+    int
+        Bytes.
+
+    Raises
+    ------
+    InputError
+        Nothing worth having is left.
+    """
+    budget = default_budget() if budget is None else budget
+    if budget < CONVERSION_BASE + (1 << 20):
+        refuse(budget, CONVERSION_BASE + (1 << 20))
+    return budget - CONVERSION_BASE
+
+
 def default_budget() -> int:
     """Half of the machine's memory, bytes."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
@@ -140,7 +168,7 @@ def blocks(
         values = 3 * n_lights * min(shard[0], texels[0]) * min(shard[1], texels[1])
         buffer = (free - values * PER_VALUE) // BUFFERS
         if buffer < BUFFER_RANGE[0]:
-            _refuse(budget, budget - free + values * PER_VALUE + BUFFERS * BUFFER_RANGE[0])
+            refuse(budget, budget - free + values * PER_VALUE + BUFFERS * BUFFER_RANGE[0])
         return Blocks(min(buffer, BUFFER_RANGE[1]), 1, n_lights)
     free -= SURFACE_BASE
     points = spp * texels[0] * texels[1]
@@ -157,10 +185,11 @@ def blocks(
                 return Blocks(BUFFER_RANGE[1], views, lights)
         if need(1, lights) <= free:
             return Blocks(BUFFER_RANGE[1], 1, lights)
-    _refuse(budget, budget - free + need(1, lights))
+    refuse(budget, budget - free + need(1, lights))
 
 
-def _refuse(budget: int, least: int) -> NoReturn:
+def refuse(budget: int, least: int) -> NoReturn:
+    """Raise InputError for a budget of fewer bytes than the least that does."""
     raise InputError(
         "memory budget too small for these settings",
         field="memory",

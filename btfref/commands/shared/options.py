@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from argparse import ArgumentParser, _ActionsContainer
 
-from btfref.commands.shared.reading import count, size
+from btfref.commands.shared.reading import count, memory_size, size
 from btfref.errors import GRID, SEED
 from btfref.sampling.settings import DTYPES
 from btfref.scene.shipped import ENVIRONMENTS, described, lights, names
@@ -87,6 +87,13 @@ def add_dtype(parser: _ActionsContainer) -> None:
         default=DTYPES[0],
         help="of the stored values (default %(default)s)",
     )
+
+
+def add_memory(
+    parser: _ActionsContainer, text: str = "budget of the process, e.g. 2G (default: half of the machine's)"
+) -> None:
+    """``--memory SIZE``, in bytes; None where it was not given."""
+    parser.add_argument("--memory", type=memory_size, metavar="SIZE", help=text)
 
 
 def add_json(parser: _ActionsContainer, what: str) -> None:

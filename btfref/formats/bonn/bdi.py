@@ -13,6 +13,10 @@ from btfref.formats.source import MEMORY, Source
 from btfref.types import Facts
 
 FULL, BZIP, SPARSE = 0, 1, 2
+
+#: Bytes of chunks after which the pages of the file that were looked at are given back.
+_RELEASE = 64 << 20
+
 _NAMES = {FULL: "full", BZIP: "full, bzip2", SPARSE: "sparse"}
 
 
@@ -79,10 +83,15 @@ class BDI:
         memory = MEMORY if self.source is None else self.source.memory
         n = max(1, min(n_views - view, memory // 4 // one))
         group = np.zeros((n, n_lights, header.n_texels, n_channels), np.float16)
+        unreleased = 0
         for number, (start, size, first, count) in enumerate(self._chunks):
             data = self._bytes(number, start, size, count)
             values = data.reshape(count, n_views, n_lights, n_channels)[:, view : view + n]
             group[:, :, self._stored[first : first + count]] = values.transpose(1, 2, 0, 3)
+            unreleased += size
+            if unreleased >= _RELEASE:
+                self._reader.release()
+                unreleased = 0
         self._group, self._first, self._last = group, view, view + n
         return group
 

@@ -80,6 +80,7 @@ def open_bonn(path: PathLike) -> Source:
             **values.facts,
         },
         fingerprint=reader.digest,
+        release=reader.release,
     )
     if isinstance(values, BDI):
         values.source = source  # which says how much memory there is

@@ -73,7 +73,7 @@ def test_the_table_of_faults(material, tmp_path, monkeypatch, capfd, need):
             status = main(row.command.split())
             if held := getattr(patch, "held", None):
                 held.close()
-        for cached in (registry.usable_points, registry.methods, registry._all_methods):
+        for cached in (registry.points.usable_points, registry.methods, registry._all_methods):
             cached.cache_clear()
         said = capfd.readouterr()
         told = f"{row.command} ({row.fault}): {status}, {said.out!r}, {said.err!r}"

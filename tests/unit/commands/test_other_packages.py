@@ -15,7 +15,7 @@ from btfref.numerics.sphere.directions import directions
 from btfref.registry import Method, broken_points, method, methods, usable_methods
 from btfref.sampling import SampledBTF
 
-CACHED = (registry.usable_points, registry.methods, registry._all_methods, registry._unloadable)
+CACHED = (registry.points.usable_points, registry.methods, registry._all_methods, registry._unloadable)
 
 
 class Point:
@@ -69,7 +69,7 @@ def packages(monkeypatch):
     own = set(methods())
     for cached in CACHED:
         cached.cache_clear()
-    monkeypatch.setattr(registry, "entry_points", found)
+    monkeypatch.setattr(registry.points, "entry_points", found)
     yield own
     for cached in CACHED:
         cached.cache_clear()

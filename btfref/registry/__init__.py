@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from inspect import signature
 from pathlib import Path
@@ -14,144 +13,18 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from btfref.errors import BtfrefError, InputError
+from btfref.registry.points import (
+    ENTRY_POINT_GROUP,
+    GROUPS,
+    BrokenPoint,
+    imported,
+    one_line,
+    packages_of,
+    usable_points,
+)
 
 if TYPE_CHECKING:
     from btfref.types import Facts, PathLike
-
-#: Third parties add rows with entry points of this group; each names an object of type :class:`Method`.
-ENTRY_POINT_GROUP = "btfref.representations"
-
-#: All groups: methods, formats of files, mesostructures.
-GROUPS = (ENTRY_POINT_GROUP, "btfref.formats", "btfref.mesostructures")
-
-
-def imported(place: str) -> Any:
-    """What ``module:object`` names."""
-    module, _, name = place.partition(":")
-    return getattr(import_module(module), name)
-
-
-@dataclass(frozen=True)
-class BrokenPoint:
-    """An entry point of a package that cannot be used.
-
-    Attributes
-    ----------
-    group, name : str
-    package : str
-        Name and version of the package that has it.
-    reason : str
-        One line.
-    """
-
-    group: str
-    name: str
-    package: str
-    reason: str
-
-    def __str__(self) -> str:
-        return f"'{self.name}' of the package {self.package} cannot be used: {self.reason}"
-
-
-def _package(point: EntryPoint) -> str:
-    dist = point.dist
-    return f"{dist.name} {dist.version}" if dist is not None else "unknown"
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())[:300]
-
-
-@cache
-def usable_points(group: str, kind: type | None = None) -> tuple[dict[str, Any], dict[str, BrokenPoint]]:
-    """Objects of the entry points of a group by name, and those that cannot be had.
-
-    Parameters
-    ----------
-    group : str
-    kind : type, optional
-        What an object must be.
-
-    Returns
-    -------
-    usable : dict of str to object
-    broken : dict of str to BrokenPoint
-    """
-    usable: dict[str, Any] = {}
-    broken: dict[str, BrokenPoint] = {}
-    for point in sorted(entry_points(group=group), key=lambda p: (p.name, p.value)):
-        try:
-            found = point.load()
-            if kind is not None and not isinstance(found, kind):
-                raise TypeError(f"{point.value} is a {type(found).__name__}, not a {kind.__name__}")
-            if point.name in usable:
-                raise ValueError("another package has that name already")
-        except (Exception, SystemExit) as error:  # whatever a foreign module raises costs that package alone
-            broken[point.name] = BrokenPoint(group, point.name, _package(point), _one_line(error))
-        else:
-            usable[point.name] = found
-    return usable, broken
-
-
-@dataclass(frozen=True)
-class Catalogue:
-    """btfref's own rows, and those of an entry-point group.
-
-    Parameters
-    ----------
-    kind : str
-        What a row is, for messages: "format".
-    rows : dict of str to str
-        Name → ``"module:object"``. No package can take the place of one of these.
-    group : str
-        Entry points whose names and objects come after them.
-    """
-
-    kind: str
-    rows: Mapping[str, str]
-    group: str
-
-    def names(self) -> list[str]:
-        """Names of all: btfref's own in their order, then those of packages that can be loaded, by the alphabet."""
-        found, _ = usable_points(self.group)
-        return [*self.rows, *sorted(found.keys() - self.rows.keys())]
-
-    def load(self, name: str) -> Any:
-        """The object of that name.
-
-        Raises
-        ------
-        InputError
-            When there is none, or its package cannot be loaded.
-        """
-        if name in self.rows:
-            return imported(self.rows[name])
-        return self._of_a_package(name)[1]
-
-    def place(self, name: str) -> str:
-        """``"module:object"`` of that name.
-
-        Raises
-        ------
-        InputError
-            As `load`.
-        """
-        return self.rows[name] if name in self.rows else self._of_a_package(name)[0]
-
-    def _of_a_package(self, name: str) -> tuple[str, Any]:
-        """``"module:object"`` of another package's entry point, and the object."""
-        found, broken = usable_points(self.group)
-        if name in found:
-            place = next(point.value for point in entry_points(group=self.group) if point.name == name)
-            return place, found[name]
-        if name in broken:
-            raise InputError(f"a {self.kind} of another package: {broken[name]}", field=self.kind)
-        raise InputError(
-            f"unknown {self.kind}",
-            field=self.kind,
-            got=repr(name),
-            expected=f"one of {', '.join(self.names())}",
-        )
 
 
 @dataclass(frozen=True)
@@ -200,7 +73,7 @@ class Method:
         except Exception as error:
             if not module.startswith(("btfref.", "mitsuba_plugins.")):
                 raise BtfrefError(
-                    f"the method '{self.key}' cannot be loaded: {module}: {_one_line(error)}"
+                    f"the method '{self.key}' cannot be loaded: {module}: {one_line(error)}"
                 ) from error
             raise
 
@@ -374,7 +247,7 @@ def _all_methods() -> tuple[dict[str, Method], dict[str, BrokenPoint]]:
     rows = {row.key: row for row in _ROWS}
     usable, broken = usable_points(ENTRY_POINT_GROUP, Method)
     broken = dict(broken)
-    packages = {point.name: _package(point) for point in entry_points(group=ENTRY_POINT_GROUP)}
+    packages = packages_of(ENTRY_POINT_GROUP)
     for name, row in usable.items():
         if row.key in rows:
             taken = f"the method '{row.key}' is there already"
@@ -399,7 +272,7 @@ def _unloadable() -> dict[str, str]:
             try:
                 _ = row.representation, row.fitting
             except Exception as error:  # whatever a foreign module lacks
-                found[key] = _one_line(error)
+                found[key] = one_line(error)
     return found
 
 
@@ -412,7 +285,7 @@ def broken_points() -> list[BrokenPoint]:
     """Entry points of installed packages, of all groups, that cannot be used."""
     groups = [group for group in GROUPS if group != ENTRY_POINT_GROUP]
     others = [one for group in groups for one in usable_points(group)[1].values()]
-    packages = {point.name: _package(point) for point in entry_points(group=ENTRY_POINT_GROUP)}
+    packages = packages_of(ENTRY_POINT_GROUP)
     modules = [
         BrokenPoint(ENTRY_POINT_GROUP, key, packages.get(key, "unknown"), reason)
         for key, reason in _unloadable().items()
