@@ -2,7 +2,7 @@
 
 Source: Meseth, Müller, Klein 2004, section 5.2. Differs from it in the foreshortening: their lobes multiply (n · l),
 approximated by (n · t); ours hold it. What lies below the local horizon, which a lobe over the sphere sees and the BTF
-does not, is cut off: the rest is looked up as the lobe that has its integral and its centroid
+does not, is cut off: the rest is looked up as two lobes that have its integral and its centroid
 (:func:`btfref.rendering.environment_light.prefilter.clipped_lobes`), and what is small and bright is no part of the
 maps (:mod:`btfref.rendering.environment_light.split_light`).
 

@@ -24,18 +24,21 @@ if TYPE_CHECKING:
     from btfref.scene.environment import Environment
 
 
-#: Sampled exponents of the paper: 2^(i/2), i = 0 … 10.
-SLICES = 11
+#: Sampled exponents: 2^(i/2), i = 0 … 12. The paper's end at 32, which smears the glow about a sun.
+SLICES = 13
 
 #: Rows of the table of what the horizon leaves of a lobe, half octaves from 1 to 4096: fits reach it at grazing views,
 #: and an error here is one under constant light too.
 CLIPPED = 25
 
-#: Texels a side of a parabolic map: 3.6 degrees at the pole, where the narrowest lobe, cos³², is 24 degrees wide.
+#: Texels a side of a parabolic map: 3.6 degrees at the pole, where the narrowest lobe, cos⁶⁴, is 17 degrees wide.
 SIZE = 64
 
 #: Directions filtered at a time: their products with the cells stay in the cache.
 BLOCK = 64
+
+#: By how much the variances of what is left of a lobe must differ for two lobes to stand for it: less is rounding.
+UNEQUAL = 1e-3
 
 #: Values of the axis' height above the horizon, from −1 to 1, in a table of clipped lobes.
 HEIGHTS = 128
@@ -152,10 +155,14 @@ def moment_maps(environment: Environment | Cells, edge: float, *, size: int = SI
 def clipped_lobes(edge: float, *, cosine: bool, slices: int = CLIPPED, heights: int = HEIGHTS) -> np.ndarray:
     """The cosine lobes that stand for lobes cut by the horizon, where lights near it fade.
 
-    A lobe about an axis ``a`` loses what is below the surface's horizon. What is left is taken as a share of a whole
-    lobe again, with the same integral and the same first moment: its axis is the centroid's direction, and its
-    exponent follows from the centroid's length R, which is ``(n + 1) / (n + 2)`` for a whole lobe. So constant
-    environments come out exactly, and those that are linear in the direction too.
+    A lobe about an axis ``a`` loses what is below the surface's horizon. What is left is wider along the horizon than
+    across it: two equal whole lobes stand for it, to both sides of its centroid by an angle δ. They have its integral,
+    its first moment, and the difference of its two variances about the centroid. A whole lobe of exponent m has a
+    centroid of length ``(m + 1) / (m + 2)`` and a variance of ``1 / (m + 3)`` across its axis, so that
+
+        R = (m + 1) / (m + 2) · cos δ,    v₂ − v₁ = m sin² δ / (m + 3)
+
+    give m and δ. So constant environments come out exactly, and those that are linear in the direction too.
 
     Parameters
     ----------
@@ -169,9 +176,8 @@ def clipped_lobes(edge: float, *, cosine: bool, slices: int = CLIPPED, heights: 
     -------
     ndarray of float32, shape (slices, heights, 4)
         By exponent and height ``a_z`` of the axis, from −1 to 1: the integral over the hemisphere, held and faded, over
-        that of the lobe over the sphere; what the axis' horizontal part is multiplied by, and what its height becomes;
-        the position of the new exponent, ``2 log2 n``, at least 0. The factor is smooth at the pole, where an angle
-        would be the root of a difference.
+        that of the lobe over the sphere; the height of the centroid's direction; the position of the new exponent,
+        ``2 log2 m``, at least 0; sin δ.
     """
     # Gauss–Legendre on both sides of the edge, in the angle: the narrowest lobe is 0.9 degrees wide everywhere. Equal
     # steps in the azimuth.
@@ -190,35 +196,51 @@ def clipped_lobes(edge: float, *, cosine: bool, slices: int = CLIPPED, heights: 
     weight = weight * np.where(z < edge, z / max(edge, 1e-30), 1) * (held if cosine else 1)
     a = np.linspace(-1, 1, heights)[:, None, None]
     product = radius[:, None] * np.sqrt(1 - a * a) * np.cos(phi) + held[:, None] * a
-    # Means over the azimuth of a lobe, and of it times cos φ.
-    means = np.stack([np.ones_like(phi), np.cos(phi)], 1) / len(phi)
+    # Means over the azimuth of a lobe, and of it times cos φ and sin² φ.
+    means = np.stack([np.ones_like(phi), np.cos(phi), np.sin(phi) ** 2], 1) / len(phi)
     # Every second exponent is twice the one before: squares, and one power for each parity.
     product = np.where(product > FLOOR, product, 0)
     chain = [product, product ** np.sqrt(2)]
-    horizontal = np.sqrt(1 - a.ravel() ** 2)
+    horizontal, sine = np.sqrt(1 - a.ravel() ** 2), np.sqrt(1 - z * z)
     result = np.zeros((slices, heights, 4))
     for i, n in enumerate(exponents(slices)):
-        total, along = np.moveaxis(chain[i % 2] @ means, -1, 0)
+        total, along, beside = np.moveaxis(chain[i % 2] @ means, -1, 0)
         if i + 2 < slices:
             chain[i % 2][chain[i % 2] < SMALLEST] = 0
             np.multiply(chain[i % 2], chain[i % 2], out=chain[i % 2])
         integral = total @ weight
-        up, across = total @ (weight * z), along @ (weight * np.sqrt(1 - z * z))
+        up, across = total @ (weight * z), along @ (weight * sine)
         length = np.hypot(up, across)
-        # A lobe that points straight down has nothing left, and one that points up keeps its direction: both take the
-        # centroid, or the factor, of their neighbour.
-        first = np.argmax(length * horizontal > 0)
-        there = np.clip(np.arange(heights), first, None)
-        r = length[there] / integral[there]
-        # Rounding takes narrow lobes to a length of 1.
-        exponent = np.maximum((2 * r - 1) / np.maximum(1 - r, 1e-9), 1)
-        inner = np.clip(there, None, heights - 2)
-        stretch = across[inner] / (length[inner] * horizontal[inner])
-        columns = [integral * (n + 1), stretch, up[there] / length[there], 2 * np.log2(exponent)]
-        result[i] = np.stack(columns, -1)
+        # A lobe that points straight down has nothing left: it takes its neighbour's centroid.
+        there = np.clip(np.arange(heights), np.argmax(length * horizontal > 0), None)
+        over = integral[there]
+        r, height, out = length[there] / over, up[there] / length[there], across[there] / length[there]
+        # Second moments: along the horizon, across and up; about the centroid, the first two by their axes.
+        yy, zz, xz = (
+            (f @ (weight * g))[there] / over
+            for f, g in ((beside, sine**2), (total, z * z), (along, sine * z))
+        )
+        v1 = height**2 * (1 - yy - zz) - 2 * height * out * xz + out**2 * zz
+        m, sideways = _pair(r, np.where(yy > (1 + UNEQUAL) * v1, yy - v1, 0))
+        result[i] = np.stack([integral * (n + 1), height, 2 * np.log2(m), sideways], -1)
     result = result.astype(np.float32)
     result.flags.writeable = False  # remembered
     return result
+
+
+def _pair(r: np.ndarray, difference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Exponent m, from 1 on, and sin δ of two lobes with a centroid of length ``r`` and a difference of variances."""
+
+    def sine2(m: np.ndarray) -> np.ndarray:
+        return np.minimum(difference * (m + 3) / m, 1)
+
+    # The centroid's length grows with m. Rounding takes that of narrow lobes to 1.
+    low, high = np.ones_like(r), np.full_like(r, 1e9)
+    for _ in range(64):
+        m = np.sqrt(low * high)
+        short = ((m + 1) / (m + 2)) ** 2 * (1 - sine2(m)) < r * r
+        low, high = np.where(short, m, low), np.where(short, high, m)
+    return low, np.sqrt(sine2(low))
 
 
 def map_lookup(maps: np.ndarray, index: np.ndarray, w: np.ndarray) -> np.ndarray:
@@ -268,21 +290,46 @@ def lobe_lookup(
     -------
     ndarray of float64, shape (..., channels)
     """
-    share, stretch, z, position = clipped_lobe(clipped, axis[..., 2], exponent)
-    moved = np.concatenate([axis[..., :2] * stretch[..., None], z[..., None]], -1)
-    world = np.einsum("...ij,...j->...i", to_world, moved)
+    share, axes, position = stand_ins(clipped, axis, exponent)
     low, f = between(position, len(maps) // 2)
     f = f[..., None]
-    mean = (1 - f) * map_lookup(maps, low, world) + f * map_lookup(maps, low + 1, world)
+    mean = np.zeros((*np.shape(share), maps.shape[-1]))
+    for one in axes:
+        world = np.einsum("...ij,...j->...i", to_world, one)
+        mean += ((1 - f) * map_lookup(maps, low, world) + f * map_lookup(maps, low + 1, world)) / len(axes)
     return (2 * np.pi / (exponent + 1) * share)[..., None] * mean
 
 
-def clipped_lobe(clipped: np.ndarray, height: np.ndarray, exponent: np.ndarray) -> np.ndarray:
-    """The columns of :func:`clipped_lobes` for any height of the axis and any exponent, shape (...) -> (4, ...)."""
+def stand_ins(
+    clipped: np.ndarray, axis: np.ndarray, exponent: np.ndarray
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """The two lobes that stand for one that the horizon cuts: :func:`clipped_lobes`.
+
+    Parameters
+    ----------
+    clipped : ndarray, shape (slices, heights, 4)
+    axis : ndarray, shape (..., 3)
+        Unit vectors in the surface's frame.
+    exponent : ndarray, shape (...)
+
+    Returns
+    -------
+    share : ndarray, shape (...)
+        What is left of the integral.
+    axes : tuple of two ndarray, shape (..., 3)
+        In the surface's frame.
+    position : ndarray, shape (...)
+        Of their exponent, among those sampled.
+    """
     low, f = between(2 * np.log2(np.maximum(exponent, 1)), len(clipped))
-    f = f[..., None]
+    f, height = f[..., None], axis[..., 2]
     columns = (1 - f) * clipped_lookup(clipped, low, height) + f * clipped_lookup(clipped, low + 1, height)
-    return np.moveaxis(columns, -1, 0)
+    share, z, position, sideways = np.moveaxis(columns, -1, 0)
+    outwards = axis[..., :2] / np.maximum(np.linalg.norm(axis[..., :2], axis=-1), FLOOR)[..., None]
+    centre = np.concatenate([outwards * np.sqrt(1 - z * z)[..., None], z[..., None]], -1)
+    centre *= np.sqrt(1 - sideways * sideways)[..., None]
+    aside = np.stack([-outwards[..., 1], outwards[..., 0], np.zeros_like(z)], -1) * sideways[..., None]
+    return share, (centre + aside, centre - aside), position
 
 
 def clipped_lookup(clipped: np.ndarray, index: np.ndarray, height: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """An environment for prefiltered lobes: what is small and bright becomes directional lights, the rest is filtered.
 
-A lobe that the horizon cuts is looked up as another lobe with the same integral and centroid
+A lobe that the horizon cuts is looked up as two others with the same integral and centroid
 (:func:`btfref.rendering.environment_light.prefilter.clipped_lobes`): good for light that is broad, and tens of
 percent off for a small one near the horizon, such as the sun. So radiance above a threshold is taken out, as P.
 Debevec did with the sun ("Rendering Synthetic Objects into Real Scenes", SIGGRAPH 1998; "A Median Cut Algorithm for
@@ -33,7 +33,7 @@ MOST = 128
 #: Receivers of the error estimate.
 RECEIVERS = 256
 
-#: Exponents of their lobes lie between 1 and this, evenly in the logarithm: the range of the maps.
+#: Exponents of their lobes lie between 1 and this, evenly in the logarithm: as narrow as measured directions resolve.
 LARGEST = 32
 
 #: Thresholds tried: the brightest cell's radiance halved, down to the mean.
@@ -161,17 +161,19 @@ class _Receivers:
         self.normal, self.axis, self.height = normal, axis, np.abs(height)
         self.exponent = LARGEST ** rng.random(RECEIVERS)
         clipped = prefilter.clipped_lobes(edge, cosine=cosine)
-        share, stretch, z, position = prefilter.clipped_lobe(clipped, self.height, self.exponent)
-        across = (axis - self.height[:, None] * normal) * stretch[:, None]
-        moved = across + z[:, None] * normal
-        self.moved = moved / np.linalg.norm(moved, axis=1, keepdims=True)
+        outwards = axis - self.height[:, None] * normal
+        out = np.linalg.norm(outwards, axis=1, keepdims=True)
+        outwards /= out
+        frame = np.stack([outwards, np.cross(normal, outwards), normal], -1)
+        local = np.concatenate([out, np.zeros_like(out), self.height[:, None]], 1)
+        self.share, axes, position = prefilter.stand_ins(clipped, local, self.exponent)
+        self.moved = [np.einsum("nij,nj->ni", frame, one) for one in axes]
         self.low, self.between = prefilter.between(position, prefilter.SLICES)
-        self.share = share
 
     def seen(self, w: np.ndarray, luminance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What receivers see of lights, and what maps show of them; (n, 3), (n, k) -> two of (RECEIVERS, k)."""
         true, shown = np.zeros((2, RECEIVERS, luminance.shape[1]))
-        single = [a.astype(np.float32) for a in (self.normal, self.axis, self.moved)]
+        single = [a.astype(np.float32) for a in (self.normal, self.axis, *self.moved)]
         exponents = prefilter.exponents().astype(np.float32)
         low, high = exponents[self.low, None], exponents[self.low + 1, None]
         f = self.between[:, None]
@@ -181,12 +183,13 @@ class _Receivers:
             for first in range(0, len(w), BLOCK):
                 part = slice(first, first + BLOCK)
                 some = luminance[part]
-                z, along, moved = (a @ w[part].T.astype(np.float32) for a in single)
+                z, along, *moved = (a @ w[part].T.astype(np.float32) for a in single)
                 lambert = np.maximum(z, 0) @ some
                 true[...] += lambert + scale * (self._lobe(z, along) @ some)
-                cosine = np.maximum(moved, 0)
-                mean = (1 - f) * (low + 1) * (cosine**low @ some) + f * (high + 1) * (cosine**high @ some)
-                shown[...] += lambert + self.share[:, None] / 2 * mean
+                shown[...] += lambert
+                for cosine in (np.maximum(one, 0) for one in moved):
+                    mean = (1 - f) * (low + 1) * (cosine**low @ some) + f * (high + 1) * (cosine**high @ some)
+                    shown[...] += self.share[:, None] / 4 * mean
         return true, shown
 
     def _lobe(self, z: np.ndarray, along: np.ndarray) -> np.ndarray:

@@ -82,7 +82,8 @@ def test_lobes_of_a_small_light_are_powers_of_cosines(rng):
     for i, n in enumerate(prefilter.exponents()):
         expected = np.maximum(w @ light, 0) ** n * (n + 1) / (2 * np.pi)
         found = prefilter.map_lookup(maps, np.full(len(w), i), w)[:, 0]
-        assert np.abs(found - expected).max() <= tolerance("environment.filter.light") * expected.max()
+        limit = tolerance("environment.filter.light") * max(1, n / 32)
+        assert np.abs(found - expected).max() <= limit * expected.max()
 
 
 def test_lobes_of_a_sky_are_its_integrals(rng):
@@ -135,11 +136,34 @@ def test_clipped_lobes_keep_their_first_moment(rng, edge, cosine):
     expected = np.maximum(axis @ raised.T, 0) ** exponent[:, None] * weight @ w
     # Maps of the environments x, y, z: the mean of a lobe is its axis times (n + 1) / (n + 2).
     share = (prefilter.exponents() + 1) / (prefilter.exponents() + 2)
-    maps = np.repeat(share, 2)[:, None, None, None] * np.tile(prefilter.map_directions(), (11, 1, 1, 1))
+    maps = np.repeat(share, 2)[:, None, None, None] * np.tile(
+        prefilter.map_directions(), (prefilter.SLICES, 1, 1, 1)
+    )
     found = prefilter.lobe_lookup(maps, clipped, axis, np.eye(3), exponent)
     assert (
         np.abs(found - expected).max() <= tolerance("environment.first_moment.max") * np.abs(expected).max()
     )
+
+
+@pytest.mark.parametrize("cosine", [False, True])
+def test_clipped_lobes_keep_the_difference_of_variances(cosine):
+    """What is left of a lobe along the horizon is wider along it than across it: so are the two that stand for it."""
+    w, weight = gauss_hemisphere(128, 256)
+    weight = weight * (w[:, 2] if cosine else 1)
+    clipped = prefilter.clipped_lobes(0.0, cosine=cosine)
+    for exponent in (4.0, 16.0, 64.0):
+        for height in (0.0, 0.15):
+            axis = np.array([np.sqrt(1 - height**2), 0, height])
+            lobe = np.maximum(w @ axis, 0) ** exponent * weight
+            moments = np.einsum("n,ni,nj->ij", lobe / lobe.sum(), w, w)
+            centre = lobe @ w / lobe.sum()
+            across = np.array([-centre[2], 0, centre[0]]) / np.hypot(centre[0], centre[2])
+            expected = moments[1, 1] - across @ moments @ across
+            _, axes, position = prefilter.stand_ins(clipped, axis[None], np.array([exponent]))
+            m = 2 ** (position[0] / 2)
+            assert axes[0][0, 1] == -axes[1][0, 1]
+            found = m / (m + 3) * axes[0][0, 1] ** 2
+            assert found == pytest.approx(expected, rel=tolerance("environment.second_moment.relative"))
 
 
 def test_sun_and_sky(need):
