@@ -7,6 +7,7 @@ the part, and ``{"type": "transform", "matrix": rows}`` for a transformation.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
@@ -14,14 +15,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from btfref.errors import InputError
+from btfref.errors import InputError, MissingDependencyError
+from btfref.mesostructure.vertex_texture import register
 
 if TYPE_CHECKING:
     from btfref.mesostructure.base import Part
     from btfref.types import Facts, JitArray, PathLike
 
 #: Images that are read by way of Pillow.
-_IMAGES = (".png", ".jpg", ".jpeg", ".tga", ".bmp")
+_IMAGES = (".png", ".jpg", ".jpeg", ".tga", ".bmp", ".tif", ".tiff")
+
+#: Modes of Pillow that are read as another one.
+_PLAIN = {"P": "RGB", "CMYK": "RGB", "YCbCr": "RGB", "LAB": "RGB", "1": "L", "LA": "RGBA", "PA": "RGBA"}
 
 
 def load_bsdf(part: Part) -> JitArray:
@@ -42,6 +47,8 @@ def load_bsdf(part: Part) -> JitArray:
     """
     import mitsuba as mi
 
+    if part.attributes:
+        register(mi)
     try:
         return mi.load_dict(_ready(part.bsdf, part.textures, mi))
     except (RuntimeError, ValueError, TypeError) as error:
@@ -71,7 +78,7 @@ def read_image(path: PathLike, *, field: str = "file") -> np.ndarray:
     Parameters
     ----------
     path : path-like
-        PNG (8 or 16 bits), JPEG, TGA, BMP or OpenEXR.
+        PNG or TIFF (8 or 16 bits), JPEG, TGA, BMP or OpenEXR.
     field : str
         Name of the parameter, for messages.
 
@@ -112,20 +119,85 @@ def _read_exr(path: Path, field: str) -> np.ndarray:
 
 
 def _read_pillow(path: Path, field: str) -> np.ndarray:
-    from PIL import Image, UnidentifiedImageError
-
     if path.suffix.lower() not in _IMAGES:
         raise InputError(
             "kind of image", file=path, field=field, expected=f"one of {', '.join((*_IMAGES, '.exr'))}"
         )
     try:
-        with Image.open(path) as image:
-            plain = {"P": "RGB", "CMYK": "RGB", "1": "L", "LA": "L", "PA": "L"}
-            array = np.asarray(image.convert(plain[image.mode]) if image.mode in plain else image)
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+        return decode_pixels(path.read_bytes(), path, field)
+    except OSError as error:
+        raise InputError("cannot read the image", file=path, field=field, got=error) from None
+
+
+def decode_pixels(data: bytes, path: PathLike, field: str) -> np.ndarray:
+    """Pixels of an image in memory, with its opacity.
+
+    Parameters
+    ----------
+    data : bytes
+        PNG, JPEG or TIFF of 8 or 16 bits, TGA, BMP or WebP.
+    path : path-like
+        For errors.
+    field : str
+
+    Returns
+    -------
+    ndarray (rows, columns, 1, 3 or 4)
+        uint8 or uint16 as stored, or float32; row 0 first.
+
+    Raises
+    ------
+    InputError
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            if _deep_colours(image, data):
+                array = _deep(data, image.format or "", path, field)
+            elif "transparency" in image.info:
+                array = np.asarray(image.convert("RGBA"))
+            else:
+                array = np.asarray(image.convert(_PLAIN[image.mode]) if image.mode in _PLAIN else image)
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError("cannot read the image", file=path, field=field, got=error) from None
     # Pillow hands 16-bit grey out as 32-bit whole numbers in some versions.
-    return array.astype(np.uint16) if array.dtype == np.int32 else array
+    array = array.astype(np.uint16) if array.dtype == np.int32 else array
+    array = array[..., None] if array.ndim == 2 else array
+    return array[..., :1] if array.shape[2] == 2 else array
+
+
+def _deep_colours(image: Any, data: bytes) -> bool:
+    """Whether an image has 16-bit colours, which Pillow would cut to 8 bits."""
+    if image.format == "PNG":  # bit depth and colour type of the header
+        return len(data) > 26 and data[24] == 16 and data[25] != 0
+    return image.format == "TIFF" and image.mode.startswith("RGB") and 16 in image.tag_v2.get(258, ())
+
+
+def _deep(data: bytes, kind: str, path: PathLike, field: str) -> np.ndarray:
+    """Pixels of a PNG by way of Mitsuba, of a TIFF by way of tifffile; uint16."""
+    if kind == "TIFF":
+        try:
+            import tifffile
+        except ImportError:
+            raise MissingDependencyError(
+                f"{path}: TIFF with 16-bit colours needs tifffile", "pip install tifffile, or save it as PNG"
+            ) from None
+        return np.asarray(tifffile.imread(io.BytesIO(data)))
+    import mitsuba as mi
+
+    previous = mi.variant()
+    if previous is None:
+        mi.set_variant("scalar_rgb")
+    try:
+        stream = mi.MemoryStream(len(data))
+        stream.write(data)
+        stream.seek(0)
+        return np.array(mi.Bitmap(stream))
+    except RuntimeError as error:
+        raise InputError("cannot read the image", file=path, field=field, got=error) from None
 
 
 def as_numbers(image: np.ndarray) -> np.ndarray:
