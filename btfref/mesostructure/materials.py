@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from btfref.errors import InputError, MissingDependencyError
-from btfref.mesostructure.vertex_texture import register
+from btfref.mesostructure.vertex_texture import PLUGIN, register
 
 if TYPE_CHECKING:
     from btfref.mesostructure.base import Part
@@ -47,8 +47,6 @@ def load_bsdf(part: Part) -> JitArray:
     """
     import mitsuba as mi
 
-    if part.attributes:
-        register(mi)
     try:
         return mi.load_dict(_ready(part.bsdf, part.textures, mi))
     except (RuntimeError, ValueError, TypeError) as error:
@@ -63,6 +61,8 @@ def _ready(value: Any, textures: dict[str, np.ndarray], mi: ModuleType) -> Any:
         return value
     if value.get("type") == "transform":
         return mi.ScalarTransform4f(np.asarray(value["matrix"], np.float64))
+    if value.get("type") == PLUGIN:
+        register(mi)
     result = {key: _ready(entry, textures, mi) for key, entry in value.items() if key != "array"}
     if "array" in value:
         array = np.array(textures[value["array"]], order="C")  # a copy: Mitsuba wants it writable

@@ -12,11 +12,11 @@ from btfref.errors import InputError
 from btfref.mesostructure import FROM_FILES
 from btfref.mesostructure.base import Mesostructure
 from btfref.mesostructure.coverage import refuse_gaps, refuse_undersides
-from btfref.mesostructure.gltf import read_gltf
 from btfref.mesostructure.materials import bsdf_from_xml
-from btfref.mesostructure.notes import Notes
-from btfref.mesostructure.pieces import Look, Piece
-from btfref.mesostructure.plain_meshes import read_plain
+from btfref.mesostructure.readers.gltf import read_gltf
+from btfref.mesostructure.readers.notes import Notes
+from btfref.mesostructure.readers.pieces import Look, Piece
+from btfref.mesostructure.readers.plain import read_plain
 from btfref.mesostructure.seams import bounds_seams, mesh_seams, refuse
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def mesh(
     bsdf : str, optional
         Mitsuba XML file with one BSDF for the whole mesh. None takes the materials of OBJ and glTF files:
         metallic-roughness becomes ``principled`` (base colour, metallic, roughness, their textures, colours of
-        vertices, normal maps, and opacity by the alpha mode, see `btfref.mesostructure.gltf.materials`),
+        vertices, normal maps, and opacity by the alpha mode, see `btfref.mesostructure.readers.gltf_materials`),
         ``Kd`` and ``map_Kd`` become ``diffuse``, or ``principled`` with GGX α = √(2 / (Ns + 2)) where ``Ks``
         is not 0; all two-sided.
     tile : sequence of 4 floats, or "bounds"

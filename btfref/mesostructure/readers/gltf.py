@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.mesostructure.gltf.container import GltfFile
-from btfref.mesostructure.gltf.materials import Material
-from btfref.mesostructure.notes import Notes
-from btfref.mesostructure.pieces import Piece
+from btfref.mesostructure.readers.container import GltfFile
+from btfref.mesostructure.readers.gltf_materials import Material
+from btfref.mesostructure.readers.notes import Notes
+from btfref.mesostructure.readers.pieces import Piece
 from btfref.types import Facts
 
 __all__ = ["read_gltf"]

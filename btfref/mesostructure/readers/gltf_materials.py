@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.mesostructure.gltf.container import GltfFile
 from btfref.mesostructure.materials import as_numbers, linear_colours, texture
-from btfref.mesostructure.notes import Notes
-from btfref.mesostructure.pieces import Look, Piece, mirrored
+from btfref.mesostructure.readers.container import GltfFile
+from btfref.mesostructure.readers.notes import Notes
+from btfref.mesostructure.readers.pieces import Look, Piece, mirrored
 from btfref.mesostructure.vertex_texture import ATTRIBUTES, vertex_texture
 from btfref.types import Facts
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.mesostructure.materials import linear_colours, texture
-from btfref.mesostructure.notes import Notes
-from btfref.mesostructure.pieces import Look, Piece
+from btfref.mesostructure.readers.notes import Notes
+from btfref.mesostructure.readers.pieces import Look, Piece
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -59,26 +59,34 @@ def read_plain(path: Path, notes: Notes) -> list[Piece]:
         resolver = trimesh.resolvers.FilePathResolver(str(path))
         source, options = io.StringIO(text), {"file_type": "obj", "resolver": resolver}
     try:
-        # Attributes of a piece depend on its kind, which trimesh does not state: points have no faces.
-        meshes: list[Any] = trimesh.load_scene(source, process=False, **options).dump()
+        scene: Any = trimesh.load_scene(source, process=False, **options)
     except Exception as error:  # every format has exceptions of its own
         raise InputError("cannot read the mesh", file=path, field="file", got=error) from None
     pieces = []
-    for piece in meshes:
-        faces = np.asarray(getattr(piece, "faces", np.zeros((0, 3))))
-        vertices = np.asarray(piece.vertices, np.float64)
+    for node in scene.graph.nodes_geometry:
+        # Taken by hand: trimesh's own way of placing geometry drops its normals.
+        matrix, name = scene.graph[node]
+        found = scene.geometry[name]
+        faces = np.asarray(getattr(found, "faces", np.zeros((0, 3))))  # points have none
         if not len(faces):
             continue
+        vertices = np.asarray(found.vertices, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
         # The property computes normals where the file has none; only its cache tells which.
-        has_normals = "vertex_normals" in piece._cache.cache
-        normals = np.asarray(piece.vertex_normals, np.float64) if has_normals else None
-        uv = getattr(piece.visual, "uv", None)
+        has_normals = "vertex_normals" in found._cache.cache
+        normals = _unit(np.asarray(found.vertex_normals, np.float64)) if has_normals else None
+        uv = getattr(found.visual, "uv", None)
         if uv is not None:
             uv = np.asarray(uv, np.float64).copy()
             if path.suffix.lower() == ".obj":  # its v points up
                 uv[:, 1] = 1 - uv[:, 1]
-        pieces.append(Piece(vertices, faces, normals, uv, _looks(piece.visual, path, notes)))
+        pieces.append(Piece(vertices, faces, normals, uv, _looks(found.visual, path, notes)))
     return pieces
+
+
+def _unit(normals: np.ndarray) -> np.ndarray | None:
+    """Normals of length 1; None where one is missing."""
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals / length if np.isfinite(length).all() and (length > 0).all() else None
 
 
 def _counted_from_the_start(path: Path) -> str | None:
