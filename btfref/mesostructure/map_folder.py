@@ -161,12 +161,11 @@ def _found(folder: Path, notes: Notes) -> dict[str, Path]:
     """Maps by what they are."""
     if not folder.is_dir():
         raise InputError("no such folder", file=folder, field="folder")
-    kinds = {word: kind for kind, words in WORDS.items() for word in words}
     found: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         if path.name.startswith(".") or not path.is_file():
             continue
-        kind = _kind(path, kinds) if path.suffix.lower() in _IMAGES else None
+        kind = kind_of(path)
         if kind is None:
             notes.add("files that are no map of a known name", path.name)
         elif kind in found:
@@ -181,10 +180,22 @@ def _found(folder: Path, notes: Notes) -> dict[str, Path]:
     return found
 
 
-def _kind(path: Path, kinds: dict[str, str]) -> str | None:
-    """What a map is by its name: the longest ending that is known."""
-    stem = _SIZE.sub("", path.stem)
-    words = re.split(r"[_\-. ]", stem)
+def kind_of(path: PathLike) -> str | None:
+    """What a map is by its name, a key of `WORDS`: by the longest ending that is known; None for other files.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    str or None
+    """
+    path = Path(path)
+    if path.suffix.lower() not in _IMAGES:
+        return None
+    kinds = {word: kind for kind, words in WORDS.items() for word in words}
+    words = re.split(r"[_\-. ]", _SIZE.sub("", path.stem))
     for n in (3, 2, 1):
         kind = kinds.get("".join(words[-n:]).lower())
         if kind is not None:
