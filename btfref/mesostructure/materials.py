@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from btfref.errors import InputError, MissingDependencyError
+from btfref.errors import BtfrefError, InputError, MissingDependencyError
 from btfref.mesostructure.vertex_texture import PLUGIN, register
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ def decode_pixels(data: bytes, path: PathLike, field: str) -> np.ndarray:
     ------
     InputError
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     try:
         with Image.open(io.BytesIO(data)) as image:
@@ -159,9 +159,9 @@ def decode_pixels(data: bytes, path: PathLike, field: str) -> np.ndarray:
                 array = np.asarray(image.convert("RGBA"))
             else:
                 array = np.asarray(image.convert(_PLAIN[image.mode]) if image.mode in _PLAIN else image)
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
+    except BtfrefError:
+        raise
+    except Exception as error:  # Pillow's decoders raise many kinds
         raise InputError("cannot read the image", file=path, field=field, got=error) from None
     # Pillow hands 16-bit grey out as 32-bit whole numbers in some versions.
     array = array.astype(np.uint16) if array.dtype == np.int32 else array

@@ -214,6 +214,36 @@ def test_nodes_turn_move_and_mirror(tmp_path):
     assert np.abs(part.vertices - SQUARE[[1, 0, 3, 2]]).max() <= tolerance("mesostructure.units")
 
 
+def test_several_materials_and_what_is_packed_in_their_textures(tmp_path, llvm):
+    """Two halves: the second node stands in the first, whose scale it shares."""
+    packed = {
+        "roughnessFactor": 0.5,
+        "metallicFactor": 0.25,
+        "metallicRoughnessTexture": {"index": 0},
+        "baseColorFactor": [1, 0, 0, 1],
+    }
+    plain = {"baseColorFactor": [0, 0, 1, 1], "metallicFactor": 0}
+    attributes = {"POSITION": 0, "TEXCOORD_0": 1}
+    primitives = [{"attributes": attributes, "indices": 2, "material": k} for k in (0, 1)]
+    top = {
+        "materials": [{"pbrMetallicRoughness": facts} for facts in (packed, plain)],
+        "meshes": [{"primitives": [one]} for one in primitives],
+        "nodes": [
+            {"mesh": 0, "scale": [0.5, 1, 1], "children": [1]},
+            {"mesh": 1, "translation": [1, 0, 0]},
+        ],
+    }
+    parts = build(gltf(tmp_path / "m.glb", {}, [_image()], top=top)).parts
+    for name, channel, factor in (("roughness", 1, 0.5), ("metallic", 2, 0.25)):
+        expected = _image()[..., channel : channel + 1] / 255 * factor
+        assert np.abs(parts[0].textures[name] - expected).max() <= tolerance("mesostructure.texture")
+    assert parts[1].bsdf["bsdf"]["roughness"] == 1
+    _, si = _hits(llvm, parts)
+    blue = np.array(si.bsdf().eval_diffuse_reflectance(si)).T[:, 2]
+    assert (blue[XY[:, 0] > 0.5] == 1).all()
+    assert (blue[XY[:, 0] < 0.5] == 0).all()
+
+
 @pytest.mark.parametrize(
     ("material", "top", "message"),
     [
