@@ -12,7 +12,7 @@ from btfref.errors import InputError
 from btfref.mesostructure.base import Mesostructure, Part, square_below
 from btfref.mesostructure.checks import number
 from btfref.mesostructure.height_map import check_heights, surface
-from btfref.mesostructure.materials import as_numbers, linear_colours, read_image, texture
+from btfref.mesostructure.materials import as_numbers, check_normals, linear_colours, read_image, texture
 from btfref.mesostructure.readers.notes import Notes
 from btfref.mesostructure.seams import map_seams, refuse
 
@@ -137,6 +137,7 @@ def map_folder(
     else:
         if "normal" in found:
             values = image("normal", 3)
+            check_normals(values, found["normal"], "normal")
             if rows == "down":  # green points up in the picture
                 values = np.stack([values[..., 0], 1 - values[..., 1], values[..., 2]], -1)
             textures["normal"] = np.ascontiguousarray(values, np.float32)

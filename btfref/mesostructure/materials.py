@@ -28,6 +28,9 @@ _IMAGES = (".png", ".jpg", ".jpeg", ".tga", ".bmp", ".tif", ".tiff")
 #: Modes of Pillow that are read as another one.
 _PLAIN = {"P": "RGB", "CMYK": "RGB", "YCbCr": "RGB", "LAB": "RGB", "1": "L", "LA": "RGBA", "PA": "RGBA"}
 
+#: How far normals of a map may point into the surface, and what share of them may do so: resampling does that to edges.
+MOST_BELOW = 0.01
+
 
 def load_bsdf(part: Part) -> JitArray:
     """The Mitsuba BSDF of a part; set a variant first.
@@ -213,6 +216,27 @@ def linear_colours(image: np.ndarray) -> np.ndarray:
 
     values = as_numbers(image) if image.dtype.kind == "f" else decode_srgb(as_numbers(image))
     return np.broadcast_to(values, (*values.shape[:2], 3)).astype(np.float32)
+
+
+def check_normals(codes: np.ndarray, path: PathLike, field: str) -> None:
+    """InputError for an image that is no normal map.
+
+    Parameters
+    ----------
+    codes : ndarray (rows, columns, 3)
+        Shares of their range: a normal is twice that less 1.
+    path : path-like
+    field : str
+    """
+    below = float((2 * codes[..., 2] - 1 < -MOST_BELOW).mean())
+    if below > MOST_BELOW:
+        raise InputError(
+            "no normal map: normals point into the surface",
+            file=path,
+            field=field,
+            got=f"{below:.3g} of the texels with a blue below one half",
+            expected="blue of at least one half",
+        )
 
 
 def texture(name: str) -> Facts:

@@ -56,7 +56,7 @@ def register(mi: ModuleType) -> None:
     _REGISTERED.add(mi.variant())
     import drjit as dr
 
-    class VertexTexture(mi.Texture):  # type: ignore[misc, name-defined]  # of the current variant
+    class VertexTexture(mi.Texture):  # type: ignore[name-defined]  # of the current variant
         def __init__(self, props: JitArray) -> None:
             mi.Texture.__init__(self, props)
             self.image = props.get("image", None)

@@ -86,7 +86,7 @@ class GltfFile:
             raise self.refusal("cannot read the mesh", got="no JSON chunk", expected="a GLB of version 2")
         return text
 
-    def entry(self, kind: str, index: object) -> Facts:
+    def entry(self, kind: str, index: Any) -> Facts:
         """An entry of one of the JSON's lists.
 
         Parameters

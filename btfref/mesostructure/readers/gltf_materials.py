@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.mesostructure.materials import as_numbers, linear_colours, texture
+from btfref.mesostructure.materials import as_numbers, check_normals, linear_colours, texture
 from btfref.mesostructure.readers.container import GltfFile
 from btfref.mesostructure.readers.notes import Notes
 from btfref.mesostructure.readers.pieces import Look, Piece, mirrored
@@ -118,7 +118,9 @@ class Material:
         if normal is None:
             look.bsdf = _finished(inner, opacity)
             return [look]
-        flat = as_numbers(self._channels(normal, "normal")) * 2 - 1
+        flat = as_numbers(self._channels(normal, "normal"))
+        check_normals(flat, self.file.path, f"{self.name}: normalTexture")
+        flat = flat * 2 - 1
         flat *= [normal.scale, normal.scale, 1.0]
         turned = mirrored(piece, self.sets[normal.set] if look.uv is None else look.uv)
         looks = []
@@ -171,7 +173,7 @@ class Material:
         info: Facts = facts[key]
         image, sampler = self.file.texture(info["index"])
         transform: Facts = info.get("extensions", {}).get("KHR_texture_transform", {})
-        number = int(transform.get("texCoord", info.get("texCoord", 0)))
+        number: Any = transform.get("texCoord", info.get("texCoord", 0))
         if number not in self.sets:
             raise self.file.refusal(
                 "texture without coordinates",

@@ -244,6 +244,12 @@ def test_several_materials_and_what_is_packed_in_their_textures(tmp_path, llvm):
     assert (blue[XY[:, 0] < 0.5] == 0).all()
 
 
+def test_colours_are_no_normal_map(tmp_path):
+    material = _base() | {"normalTexture": {"index": 0}, "name": "stone"}
+    with pytest.raises(InputError, match=r"no normal map.*'stone: normalTexture'.*1 of the texels"):
+        build(gltf(tmp_path / "m.gltf", material, [_image()]))
+
+
 @pytest.mark.parametrize(
     ("material", "top", "message"),
     [
@@ -271,10 +277,11 @@ def test_what_is_ignored_is_named_once_and_stands_in_the_store(tmp_path, llvm, c
     from btfref.sampling import open_store
 
     material = _base() | {"occlusionTexture": {"index": 0}, "name": "stone"}
-    material["normalTexture"] = {"index": 0}
+    material["normalTexture"] = {"index": 1}
     top = {"extensionsUsed": ["KHR_materials_clearcoat"], "animations": [{}]}
     tangents = np.tile([1, 0, 0, 1], (4, 1))
-    file = gltf(tmp_path / "m.glb", material, [_image()], top=top, TANGENT=tangents)
+    up = np.full((2, 2, 3), (128, 128, 255), np.uint8)
+    file = gltf(tmp_path / "m.glb", material, [_image(), up], top=top, TANGENT=tangents)
     out = tmp_path / "m.btf.zarr"
     small = ["--texels", "2", "--views", "1x3", "--lights", "1x3", "--spp", "2"]
     assert main(["synth", str(file), "-o", str(out), *small]) == 0
