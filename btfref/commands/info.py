@@ -121,6 +121,10 @@ def _foreign(path: Path) -> Facts | None:
     found = foreign(path)
     if found is None or (path.is_dir() and found.name in ("empty", "files")):  # any folder is that
         return None
+    if path.is_dir() and found.name != "maps":
+        raise InputError(
+            f"no store, and not a BTF of a known format: {found.what}", file=path, expected=found.cure
+        )
     return {"kind": "foreign", "format": found.name, "what": found.what, "instead": found.cure}
 
 

@@ -126,7 +126,7 @@ def open_source(path: PathLike, *, format: str | None = None, **options: object)
         from btfref.formats.foreign import foreign
 
         if (other := foreign(path)) is not None:
-            raise InputError(f"no BTF that can be read: {other.what}", file=path, expected=other.cure)
+            raise InputError(f"not a BTF of a known format: {other.what}", file=path, expected=other.cure)
         raise InputError("not a BTF of a known format", file=path, expected=f"one of {', '.join(names())}")
     return format_named(name).open_checked(path, options)
 

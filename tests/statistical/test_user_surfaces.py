@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from gltf_files import UV, gltf
+from gltf_files import FACES, SQUARE, UV, gltf
 from PIL import Image
 from plain_renders import PlainRenders
 
@@ -32,17 +32,18 @@ def _bitmap(mi, path, uv, **more):
     return {"type": "bitmap", "filename": str(path), "to_uv": mi.ScalarTransform4f(uv), **more}
 
 
-def _equal(mi, file, plain, *, estimator, spp, rounds=8, texels=8, **settings):
+def _equal(mi, file, plain, *, estimator, spp, rounds=8, texels=8, depth=4, integrator="path", **settings):
     """p of every texel, channel and pair; and with the lights exchanged."""
     btf = synthesize(
-        file, texels=texels, views=VECTORS, lights=VECTORS, spp=spp, dtype="float32", max_depth=4,
+        file, texels=texels, views=VECTORS, lights=VECTORS, spp=spp, dtype="float32", max_depth=depth,
         estimator=estimator, seed=5, **settings,
     )  # fmt: skip
     assert btf.attributes["estimator"] == estimator
-    renders = PlainRenders(mi, plain, texels=texels, reach=3, max_depth=4)
+    renders = PlainRenders(mi, plain, texels=texels, reach=3, max_depth=depth)
+    renders.integrator = mi.load_dict({"type": integrator, "max_depth": depth})
     images = [renders.pair(VECTORS[v], VECTORS[k], spp=spp, rounds=rounds, seed=31 * v + k) for v, k in PAIRS]
     mean, variance = (np.stack(part) for part in zip(*images, strict=True))
-    floor = (tolerance("mesostructure.texture") * mean.max()) ** 2
+    floor = (tolerance("synthesis.flat_eval") * mean.max()) ** 2
 
     def p(pairs):
         own = [np.stack([array[v, k] for v, k in pairs]) for array in (btf.values, btf.variance)]
@@ -60,7 +61,7 @@ def _assert_equal(found):
 
 
 @pytest.mark.parametrize("estimator", ["path", pytest.param("surface", marks=pytest.mark.long)])
-@pytest.mark.parametrize("spp", [32, pytest.param(512, marks=pytest.mark.long)])
+@pytest.mark.parametrize("spp", [128, pytest.param(1024, marks=pytest.mark.long)])
 def test_a_folder_of_maps(tmp_path, llvm, estimator, spp):
     folder = tmp_path / "Rock"
     folder.mkdir()
@@ -83,7 +84,7 @@ def test_a_folder_of_maps(tmp_path, llvm, estimator, spp):
 
 
 @pytest.mark.parametrize("estimator", ["path", "surface"])
-@pytest.mark.parametrize("spp", [32, pytest.param(512, marks=pytest.mark.long)])
+@pytest.mark.parametrize("spp", [128, pytest.param(1024, marks=pytest.mark.long)])
 def test_a_glb_with_a_transform_a_second_set_and_a_normal_map(tmp_path, llvm, estimator, spp):
     """All textures on the second set, two of them moved: one BSDF of Mitsuba can show it, written by hand."""
     colour = np.stack([_waves(16, 1, s) for s in (0, 0.3, 0.7)], -1)
@@ -122,3 +123,39 @@ def test_a_glb_with_a_transform_a_second_set_and_a_normal_map(tmp_path, llvm, es
     part = build("flat").parts[0]
     plain = Mesostructure("plain", {}, (Part(part.vertices, part.faces, bsdf, normals=part.normals),))
     _assert_equal(_equal(llvm, file, plain, estimator=estimator, spp=spp))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("spp", [128, 1024])
+def test_a_sheet_that_blends_over_a_floor(tmp_path, llvm, spp):
+    """Shadows of what is half there: Mitsuba's volpath, whose shadow rays pass masks as well."""
+    colour = np.stack([_waves(16, 1, s) for s in (0, 0.3, 0.7)], -1)
+    alpha = _waves(16, 2, 0.1)
+    alpha[0, 0] = 1  # the floor is there
+    material = {
+        "pbrMetallicRoughness": {
+            "metallicFactor": 0,
+            "roughnessFactor": 0.6,
+            "baseColorTexture": {"index": 0},
+        },
+        "alphaMode": "BLEND",
+    }
+    vertices = np.concatenate([SQUARE, SQUARE - [0, 0, 0.2]])
+    faces, uv = np.concatenate([FACES, FACES + 4]), np.concatenate([UV, 0 * UV + 1 / 32])
+    codes = np.round(np.concatenate([colour, alpha[..., None]], -1) * 255)
+    file = gltf(tmp_path / "m.glb", material, [codes], vertices=vertices, faces=faces, sets=(uv,))
+    _save(tmp_path / "c.png", colour)
+    _save(tmp_path / "a.png", alpha)
+    inner = {
+        "type": "principled",
+        "base_color": {"type": "bitmap", "filename": str(tmp_path / "c.png"), "format": "variant"},
+        "roughness": 0.6,
+        "specular": 0.5,
+    }
+    bsdf = {
+        "type": "mask",
+        "opacity": {"type": "bitmap", "filename": str(tmp_path / "a.png"), "raw": True, "format": "variant"},
+        "b": {"type": "twosided", "b": inner},
+    }
+    plain = Mesostructure("plain", {}, (Part(vertices, faces, bsdf, uv=uv),))
+    _assert_equal(_equal(llvm, file, plain, estimator="path", spp=spp, depth=-1, integrator="volpath"))

@@ -69,7 +69,7 @@ def test_what_a_file_is_and_what_to_do(name, tmp_path, capsys):
     assert main(["info", str(path), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["kind"] == "foreign"
-    with pytest.raises(InputError, match=rf"no BTF that can be read: .*{what}.*{cure}") as error:
+    with pytest.raises(InputError, match=rf"not a BTF of a known format: .*{what}.*{cure}") as error:
         open_source(path)
     assert "\n" not in str(error.value)
     assert facts["what"] in str(error.value)
@@ -83,9 +83,16 @@ def test_a_file_that_nobody_knows_is_no_foreign_format(tmp_path, capsys):
     assert main(["info", str(path)]) == 2
     with pytest.raises(InputError, match="not a BTF of a known format"):
         open_source(path)
-    (tmp_path / "empty").mkdir()
-    assert main(["info", str(tmp_path / "empty")]) == 2
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    assert main(["info", str(folder)]) == 2
     capsys.readouterr()
+    _bytes(folder / "IMG_1.jpg", b"x")
+    assert main(["info", str(folder)]) == 2
+    assert "--pattern" in capsys.readouterr().err
+    (folder / "IMG_1.jpg").rename(folder / "Rock_Color.jpg")
+    assert main(["info", str(folder)]) == 0
+    assert "btfref synth FOLDER" in capsys.readouterr().out
 
 
 # --- pictures under other names

@@ -446,8 +446,9 @@ def test_indices_that_count_back_are_read_where_they_stand(tmp_path):
     lines = [*_corners(0, 0.5), *uv, face, *_corners(0.5, 1), *[t.replace("1", "0.5") for t in uv], face]
     (part,) = build(_bare(tmp_path, lines), **_material(tmp_path)).parts
     middles = part.vertices[part.faces].mean(1)
-    assert sorted((middles[:, 0] > 0.5).tolist()) == [False, False, True, True]
-    assert part.uv[part.faces][middles[:, 0] > 0.5][..., 0].max() == 0.5
+    right = middles[:, 0] > 0.5
+    assert sorted(right.tolist()) == [False, False, True, True]
+    assert part.uv[part.faces][right][..., 0].max() == 0.5
     with pytest.raises(InputError, match="'line 5'; got -9; expected at least -4"):
         build(_bare(tmp_path, [*_corners(0, 1), "f -9 -3 -2"]), **_material(tmp_path))
 
