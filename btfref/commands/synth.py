@@ -181,7 +181,7 @@ def run(args: Namespace) -> int:
             raise InputError("not a parameter of the mesostructure", field="--set", got=key, expected=option)
 
     from btfref.sampling.store.selection import Selection
-    from btfref.sampling.synthesis import synthesize_store
+    from btfref.sampling.synthesis import make_job
 
     chosen = vars(args) | {
         "views": direction_set(args.views),
@@ -198,12 +198,13 @@ def run(args: Namespace) -> int:
     elif args.define or args.sweep or args.indirect:
         raise InputError("these are parameters of scenes", field="-D, --sweep, --indirect", expected="--for")
 
+    job = make_job(args.mesostructure, settings, parameters)
+    for line in job.mesostructure.ignored:
+        sys.stderr.write(f"btfref: warning: {printable(line)}\n")
     peak: list[int] = []
     with Progress() as progress:
-        store = synthesize_store(
+        store = job.to_store(
             out,
-            args.mesostructure,
-            settings,
             overwrite=args.overwrite,
             progress=progress,
             only=only,
@@ -211,11 +212,8 @@ def run(args: Namespace) -> int:
             scheduler=args.scheduler,
             workers=args.workers,
             report=peak.append,
-            **parameters,
         )
     info = store.info() | {"peak_memory_bytes": peak[0]}
-    for line in store.attributes.get("ignored", ()):
-        sys.stderr.write(f"btfref: warning: {printable(line)}\n")
     if args.json:
         emit_json(info)
         return 0
