@@ -200,7 +200,7 @@ def run(args: Namespace) -> int:
 
     job = make_job(args.mesostructure, settings, parameters)
     for line in job.mesostructure.ignored:
-        sys.stderr.write(f"btfref: warning: {printable(line)}\n")
+        sys.stderr.write(f"btfref: warning: ignored: {printable(line)}\n")
     peak: list[int] = []
     with Progress() as progress:
         store = job.to_store(

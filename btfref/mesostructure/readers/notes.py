@@ -26,6 +26,5 @@ class Notes:
     def lines(self) -> tuple[str, ...]:
         """One line of each kind, in the order in which they were met."""
         return tuple(
-            f"ignored: {what}" + (f" ({', '.join(names)})" if names else "")
-            for what, names in self._kinds.items()
+            what + (f" ({', '.join(names)})" if names else "") for what, names in self._kinds.items()
         )

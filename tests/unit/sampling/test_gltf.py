@@ -291,6 +291,6 @@ def test_what_is_ignored_is_named_once_and_stands_in_the_store(tmp_path, llvm, c
     assert [word for line in warnings for word in words if word in line] == words
     assert len(warnings) == 4
     assert "(stone)" in warnings[-1]
-    assert [f"btfref: warning: {line}" for line in open_store(out).attributes["ignored"]] == warnings
+    assert [f"btfref: warning: ignored: {line}" for line in open_store(out).attributes["ignored"]] == warnings
     assert main(["synth", str(file), "-o", str(out), "--json", *small]) == 0
     assert json.loads(capsys.readouterr().out)["attributes"]["ignored"]

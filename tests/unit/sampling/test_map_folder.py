@@ -117,10 +117,10 @@ def test_what_is_ignored_is_named(folder):
     (folder / "Rock.blend").write_text("x")
     (folder / ".DS_Store").write_text("x")
     assert build(folder).ignored == (
-        "ignored: files that are no map of a known name (Rock.blend)",
-        "ignored: normal map whose green points down; *_NormalGL is read (Rock_2K_NormalDX.png)",
-        "ignored: ambient occlusion: paths find it themselves (Rock_2K_AmbientOcclusion.jpg)",
-        "ignored: normal map beside a displacement, which has its slopes (Rock_2K_NormalGL.png)",
+        "files that are no map of a known name (Rock.blend)",
+        "normal map whose green points down; *_NormalGL is read (Rock_2K_NormalDX.png)",
+        "ambient occlusion: paths find it themselves (Rock_2K_AmbientOcclusion.jpg)",
+        "normal map beside a displacement, which has its slopes (Rock_2K_NormalGL.png)",
     )
 
 

@@ -496,8 +496,8 @@ def test_a_wavefront_material_that_emits_is_refused_and_maps_that_are_not_read_a
     text = (tmp_path / "m.mtl").read_text()
     (tmp_path / "m.mtl").write_text(text + "map_Bump t.png\nd 0.5\n")
     assert build(file).ignored == (
-        "ignored: bump map of a Wavefront material (a)",
-        "ignored: opacity (d, Tr) of a Wavefront material (a)",
+        "bump map of a Wavefront material (a)",
+        "opacity (d, Tr) of a Wavefront material (a)",
     )
     (tmp_path / "m.mtl").write_text(text + "Ke 1 1 1\n")
     with pytest.raises(InputError, match=r"emits light.*a: Ke"):
