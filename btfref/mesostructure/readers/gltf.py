@@ -142,8 +142,8 @@ def _piece(file: GltfFile, primitive: Facts, matrix: np.ndarray, notes: Notes) -
     if not len(faces):
         return None
     linear = matrix[:3, :3]
-    determinant = np.linalg.det(linear)
-    if not np.isfinite(matrix).all() or determinant == 0:
+    determinant = np.linalg.det(linear) if np.isfinite(matrix).all() else 0.0
+    if determinant == 0:
         raise file.refusal("transformation of a node", "nodes", expected="one that can be inverted")
     normals = None
     if "NORMAL" in attributes:
