@@ -47,6 +47,12 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument("--lights", metavar="SET", help="likewise")
     add_dtype(parser)
+    parser.add_argument(
+        "--pattern",
+        metavar="NAME",
+        help='names of pictures, e.g. "cam_{tv}_{pv}_light_{tl}_{pl}.jpg": polar angle and azimuth of the view '
+        "(tv, pv) and of the light (tl, pl) in degrees, * for any letters; read as ubo unless --format is given",
+    )
     add_memory(parser)
     parser.add_argument("--overwrite", action="store_true", help="replace a store of other settings")
     add_json(parser, "the facts of the store")
@@ -75,6 +81,7 @@ def run(args: Namespace) -> int:
             progress=progress,
             allow_missing=args.allow_missing or None,
             gamma=args.gamma,
+            pattern=args.pattern,
             views=args.views and direction_set(args.views),
             lights=args.lights and direction_set(args.lights),
         )

@@ -72,7 +72,8 @@ def read(path: PathLike) -> Facts:
     Returns
     -------
     dict
-        With ``kind``: "representation", "sampled BTF" or "image".
+        With ``kind``: "representation", "sampled-btf", "measured-btf", "image", or "foreign" for a file of others that
+        is known and not read: ``what`` it is and what serves ``instead``.
 
     Raises
     ------
@@ -83,15 +84,16 @@ def read(path: PathLike) -> Facts:
     if path.is_dir():
         from btfref.sampling import open_store
 
-        if (path / "zarr.json").exists() or path.name.endswith(".zarr") or not (measured := _measured(path)):
-            return open_store(path).info()
-        return measured
+        store = (path / "zarr.json").exists() or path.name.endswith(".zarr")
+        if not store and (found := _measured(path) or _foreign(path)):
+            return found
+        return open_store(path).info()
     if path.suffix.lower() == ".png":
         return _png(path)
     if path.suffix.lower() == ".exr" and _plain_exr(path):
         return _exr(path)
-    if path.is_file() and path.suffix.lower() != ".exr" and (measured := _measured(path)):
-        return measured
+    if path.is_file() and path.suffix.lower() != ".exr" and (found := _measured(path) or _foreign(path)):
+        return found
     from btfref.representations.file.container import read_info
 
     return read_info(path)
@@ -108,6 +110,22 @@ def _measured(path: Path) -> Facts | None:
         return None
     missing = {"allow_missing": True} if "allow_missing" in format_named(name).options else {}
     return open_source(path, format=name, **missing).info()
+
+
+def _foreign(path: Path) -> Facts | None:
+    """What a file or folder is that btfref does not read, and what to do; None when nobody knows it."""
+    from btfref.formats.foreign import foreign
+
+    if path.is_file() and path.stat().st_size == 0:
+        return None
+    found = foreign(path)
+    if found is None or (path.is_dir() and found.name in ("empty", "files")):  # any folder is that
+        return None
+    if path.is_dir() and found.name != "maps":
+        raise InputError(
+            f"no store, and not a BTF of a known format: {found.what}", file=path, expected=found.cure
+        )
+    return {"kind": "foreign", "format": found.name, "what": found.what, "instead": found.cure}
 
 
 def _headers(path: Path) -> list[Facts] | None:

@@ -6,6 +6,7 @@ it now, and the same command with another part, or without, fills more later (bt
 
   btfref synth checker -o checker.btf.zarr --views ubo81 --lights ubo81 --spp 16
   btfref synth stone.png -o stone.btf.zarr --albedo stone-colour.png --roughness 0.6 --amplitude 0.1
+  btfref synth Bricks076_2K/ -o bricks.btf.zarr --amplitude 0.05
   btfref synth cloth.glb -o cloth.btf.zarr --target-error 0.02 --memory 4G
   btfref synth checker -o checker.btf.zarr --for plane --size 512x512
   btfref synth weave.ply --bsdf yarn.xml -o weave.btf.zarr --scheduler dask --workers 4
@@ -15,11 +16,12 @@ from __future__ import annotations
 
 import functools
 import operator
+import sys
 from argparse import ArgumentParser, Namespace
 
 from btfref.commands.demand import add_scene_arguments, union, whole_shape
 from btfref.commands.shared.options import add_dtype, add_json, add_memory, add_seed
-from btfref.commands.shared.printing import Progress, bytes_text, emit, emit_json
+from btfref.commands.shared.printing import Progress, bytes_text, emit, emit_json, printable
 from btfref.commands.shared.reading import (
     assignments,
     count,
@@ -46,8 +48,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "mesostructure",
         metavar="MESO",
-        help="name of a mesostructure (checker, rings, tissue, flat), a mesh (PLY, OBJ, GLB, STL, OFF) or a "
-        "height map (PNG of 8 or 16 bits, OpenEXR)",
+        help="name of a mesostructure (checker, rings, tissue, flat), a mesh (PLY, OBJ, GLB, STL, OFF), a height "
+        "map (PNG or TIFF of 8 or 16 bits, OpenEXR), or a folder of maps (*_Color, *_Displacement, *_NormalGL, …)",
     )
     parser.add_argument("-o", "--output", required=True, metavar="OUT.btf.zarr", help="the store to write")
     default = SynthesisSettings  # its fields' defaults, as attributes of the class
@@ -176,7 +178,7 @@ def run(args: Namespace) -> int:
             raise InputError("not a parameter of the mesostructure", field="--set", got=key, expected=option)
 
     from btfref.sampling.store.selection import Selection
-    from btfref.sampling.synthesis import synthesize_store
+    from btfref.sampling.synthesis import make_job
 
     chosen = vars(args) | {
         "views": direction_set(args.views),
@@ -193,12 +195,13 @@ def run(args: Namespace) -> int:
     elif args.define or args.sweep or args.indirect:
         raise InputError("these are parameters of scenes", field="-D, --sweep, --indirect", expected="--for")
 
+    job = make_job(args.mesostructure, settings, parameters)
+    for line in job.mesostructure.ignored:
+        sys.stderr.write(f"btfref: warning: ignored: {printable(line)}\n")
     peak: list[int] = []
     with Progress() as progress:
-        store = synthesize_store(
+        store = job.to_store(
             out,
-            args.mesostructure,
-            settings,
             overwrite=args.overwrite,
             progress=progress,
             only=only,
@@ -206,7 +209,6 @@ def run(args: Namespace) -> int:
             scheduler=args.scheduler,
             workers=args.workers,
             report=peak.append,
-            **parameters,
         )
     info = store.info() | {"peak_memory_bytes": peak[0]}
     if args.json:

@@ -120,7 +120,13 @@ def open_source(path: PathLike, *, format: str | None = None, **options: object)
         Not a BTF of a known format, or a damaged one.
     """
     name = format or identify(path)
+    if name is None and options.get("pattern") is not None:
+        name = "ubo"  # photographs, whatever their names
     if name is None:
+        from btfref.formats.foreign import foreign
+
+        if (other := foreign(path)) is not None:
+            raise InputError(f"not a BTF of a known format: {other.what}", file=path, expected=other.cure)
         raise InputError("not a BTF of a known format", file=path, expected=f"one of {', '.join(names())}")
     return format_named(name).open_checked(path, options)
 

@@ -27,6 +27,7 @@ MESOSTRUCTURES = {
     "checker": "btfref.mesostructure.checker:checker",
     "flat": "btfref.mesostructure.flat:flat",
     "height_map": "btfref.mesostructure.height_map:height_map",
+    "map_folder": "btfref.mesostructure.map_folder:map_folder",
     "mesh": "btfref.mesostructure.mesh:mesh",
     "rings": "btfref.mesostructure.rings:rings",
     "tissue": "btfref.mesostructure.tissue:tissue",
@@ -34,8 +35,9 @@ MESOSTRUCTURES = {
 
 #: Mesostructures made from a user's file: name -> suffixes. A file's name stands for them.
 FROM_FILES = {
-    "height_map": (".png", ".exr"),
+    "height_map": (".png", ".exr", ".tif", ".tiff"),
     "mesh": (".ply", ".obj", ".glb", ".gltf", ".stl", ".off"),
+    "map_folder": (),  # a folder
 }
 
 ENTRY_POINT_GROUP = "btfref.mesostructures"
@@ -65,8 +67,8 @@ def build(mesostructure: PathLike | Mesostructure, **parameters: Any) -> Mesostr
     Parameters
     ----------
     mesostructure : str, path-like or Mesostructure
-        A registered name, or a user's file: PNG and OpenEXR are height maps, PLY, OBJ, GLB and others meshes.
-        A `Mesostructure` is handed through (and takes no parameters).
+        A registered name, or a user's file: PNG, TIFF and OpenEXR are height maps, PLY, OBJ, GLB and others meshes,
+        a folder holds maps of one material. A `Mesostructure` is handed through (and takes no parameters).
     **parameters
         Parameters of that mesostructure, e.g. ``amplitude`` in tile units.
 
@@ -89,6 +91,9 @@ def build(mesostructure: PathLike | Mesostructure, **parameters: Any) -> Mesostr
         return mesostructure
     mesostructure = str(mesostructure)
     suffix = Path(mesostructure).suffix.lower()
+    if mesostructure not in names() and Path(mesostructure).is_dir():
+        parameters = {"folder": mesostructure, **parameters}
+        mesostructure, suffix = "map_folder", ""
     for name, suffixes in FROM_FILES.items():
         if suffix in suffixes:
             parameters = {"file": mesostructure, **parameters}

@@ -35,6 +35,8 @@ class Part:
         Texture coordinates as Mitsuba has them (v = 0 is an image's first row); None takes x and y.
     textures : dict of str to ndarray
         Images that the BSDF refers to by ``{"type": "bitmap", "array": NAME}``.
+    attributes : dict of str to ndarray (V, 1 to 3)
+        Numbers of the vertices that the BSDF refers to as ``vertex_NAME``.
     """
 
     vertices: np.ndarray
@@ -43,6 +45,7 @@ class Part:
     normals: np.ndarray | None = None
     uv: np.ndarray | None = None
     textures: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
+    attributes: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
@@ -74,11 +77,14 @@ class Mesostructure:
     parameters : dict
         All parameters with defaults filled in, JSON types: they rebuild this mesostructure.
     parts : tuple of Part
+    ignored : tuple of str
+        What of the user's input has no part in it, one line of each kind.
     """
 
     name: str
     parameters: Facts = field(repr=False)
     parts: tuple[Part, ...] = field(repr=False)
+    ignored: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         try:

@@ -47,7 +47,7 @@ def height_map(
     Parameters
     ----------
     file : str
-        PNG of 8 or 16 bits (0 … 1), or OpenEXR (heights as they are); its first channel.
+        PNG or TIFF of 8 or 16 bits (0 … 1), or OpenEXR (heights as they are); its first channel.
     amplitude : float
         Height in tile units of one unit of the map; the top is moved to the sampling plane.
     albedo : str or sequence of 3 floats
@@ -72,16 +72,13 @@ def height_map(
     amplitude = number("the height map", "amplitude", amplitude, 0.0, 4.0)
     image = read_image(file)
     heights = as_numbers(image)[..., 0]
-    if min(heights.shape) < 2 or max(heights.shape) > LARGEST:
-        size = " x ".join(map(str, heights.shape))
-        raise InputError("size of a height map", file=file, got=size, expected=f"2 to {LARGEST} a side")
-    refuse(map_seams(heights[..., None], "heights"), file=file, allow=allow_seams)
+    check_heights(heights, file, allow_seams)
     textures: dict[str, np.ndarray] = {}
     if bsdf is not None:
         material, textures = bsdf_from_xml(bsdf)
     else:
         material = _material(albedo, roughness, textures, allow_seams)
-    part = _surface(amplitude * (heights - heights.max()), material, textures)
+    part = surface(amplitude * (heights - heights.max()), material, textures)
     parameters = {
         "file": str(file),
         "amplitude": amplitude,
@@ -137,8 +134,28 @@ def _map(
     return {"type": "rgb", "value": values.tolist()}
 
 
-def _surface(heights: np.ndarray, material: Facts, textures: dict[str, np.ndarray]) -> Part:
-    """The part through pixel centres and on to the next tile's first ones."""
+def check_heights(heights: np.ndarray, file: PathLike, allow_seams: bool) -> None:
+    """InputError for heights (rows, columns) of a size that cannot be taken, or with a seam."""
+    if min(heights.shape) < 2 or max(heights.shape) > LARGEST:
+        size = " x ".join(map(str, heights.shape))
+        raise InputError("size of a height map", file=file, got=size, expected=f"2 to {LARGEST} a side")
+    refuse(map_seams(heights[..., None], "heights"), file=file, allow=allow_seams)
+
+
+def surface(heights: np.ndarray, material: Facts, textures: dict[str, np.ndarray]) -> Part:
+    """The part through pixel centres and on to the next tile's first ones.
+
+    Parameters
+    ----------
+    heights : ndarray (rows, columns)
+        Tile units, at most 0.
+    material : dict
+    textures : dict of str to ndarray
+
+    Returns
+    -------
+    Part
+    """
     rows, columns = heights.shape
     row, column = (index.ravel() for index in np.mgrid[0 : rows + 1, 0 : columns + 1])
     x, y = (column + 0.5) / columns, (row + 0.5) / rows

@@ -7,6 +7,7 @@ the part, and ``{"type": "transform", "matrix": rows}`` for a transformation.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
@@ -14,14 +15,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from btfref.errors import InputError
+from btfref.errors import BtfrefError, InputError, MissingDependencyError
+from btfref.mesostructure.vertex_texture import PLUGIN, register
 
 if TYPE_CHECKING:
     from btfref.mesostructure.base import Part
     from btfref.types import Facts, JitArray, PathLike
 
 #: Images that are read by way of Pillow.
-_IMAGES = (".png", ".jpg", ".jpeg", ".tga", ".bmp")
+_IMAGES = (".png", ".jpg", ".jpeg", ".tga", ".bmp", ".tif", ".tiff")
+
+#: Modes of Pillow that are read as another one.
+_PLAIN = {"P": "RGB", "CMYK": "RGB", "YCbCr": "RGB", "LAB": "RGB", "1": "L", "LA": "RGBA", "PA": "RGBA"}
+
+#: How far normals of a map may point into the surface, and what share of them may do so: resampling does that to edges.
+MOST_BELOW = 0.01
 
 
 def load_bsdf(part: Part) -> JitArray:
@@ -56,6 +64,8 @@ def _ready(value: Any, textures: dict[str, np.ndarray], mi: ModuleType) -> Any:
         return value
     if value.get("type") == "transform":
         return mi.ScalarTransform4f(np.asarray(value["matrix"], np.float64))
+    if value.get("type") == PLUGIN:
+        register(mi)
     result = {key: _ready(entry, textures, mi) for key, entry in value.items() if key != "array"}
     if "array" in value:
         array = np.array(textures[value["array"]], order="C")  # a copy: Mitsuba wants it writable
@@ -71,7 +81,7 @@ def read_image(path: PathLike, *, field: str = "file") -> np.ndarray:
     Parameters
     ----------
     path : path-like
-        PNG (8 or 16 bits), JPEG, TGA, BMP or OpenEXR.
+        PNG or TIFF (8 or 16 bits), JPEG, TGA, BMP or OpenEXR.
     field : str
         Name of the parameter, for messages.
 
@@ -112,20 +122,85 @@ def _read_exr(path: Path, field: str) -> np.ndarray:
 
 
 def _read_pillow(path: Path, field: str) -> np.ndarray:
-    from PIL import Image, UnidentifiedImageError
-
     if path.suffix.lower() not in _IMAGES:
         raise InputError(
             "kind of image", file=path, field=field, expected=f"one of {', '.join((*_IMAGES, '.exr'))}"
         )
     try:
-        with Image.open(path) as image:
-            plain = {"P": "RGB", "CMYK": "RGB", "1": "L", "LA": "L", "PA": "L"}
-            array = np.asarray(image.convert(plain[image.mode]) if image.mode in plain else image)
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+        return decode_pixels(path.read_bytes(), path, field)
+    except OSError as error:
+        raise InputError("cannot read the image", file=path, field=field, got=error) from None
+
+
+def decode_pixels(data: bytes, path: PathLike, field: str) -> np.ndarray:
+    """Pixels of an image in memory, with its opacity.
+
+    Parameters
+    ----------
+    data : bytes
+        PNG, JPEG or TIFF of 8 or 16 bits, TGA, BMP or WebP.
+    path : path-like
+        For errors.
+    field : str
+
+    Returns
+    -------
+    ndarray (rows, columns, 1, 3 or 4)
+        uint8 or uint16 as stored, or float32; row 0 first.
+
+    Raises
+    ------
+    InputError
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            if _deep_colours(image, data):
+                array = _deep(data, image.format or "", path, field)
+            elif "transparency" in image.info:
+                array = np.asarray(image.convert("RGBA"))
+            else:
+                array = np.asarray(image.convert(_PLAIN[image.mode]) if image.mode in _PLAIN else image)
+    except BtfrefError:
+        raise
+    except Exception as error:  # Pillow's decoders raise many kinds
         raise InputError("cannot read the image", file=path, field=field, got=error) from None
     # Pillow hands 16-bit grey out as 32-bit whole numbers in some versions.
-    return array.astype(np.uint16) if array.dtype == np.int32 else array
+    array = array.astype(np.uint16) if array.dtype == np.int32 else array
+    array = array[..., None] if array.ndim == 2 else array
+    return array[..., :1] if array.shape[2] == 2 else array
+
+
+def _deep_colours(image: Any, data: bytes) -> bool:
+    """Whether an image has 16-bit colours, which Pillow would cut to 8 bits."""
+    if image.format == "PNG":  # bit depth and colour type of the header
+        return len(data) > 26 and data[24] == 16 and data[25] != 0
+    return image.format == "TIFF" and image.mode.startswith("RGB") and 16 in image.tag_v2.get(258, ())
+
+
+def _deep(data: bytes, kind: str, path: PathLike, field: str) -> np.ndarray:
+    """Pixels of a PNG by way of Mitsuba, of a TIFF by way of tifffile; uint16."""
+    if kind == "TIFF":
+        try:
+            import tifffile
+        except ImportError:
+            raise MissingDependencyError(
+                f"{path}: TIFF with 16-bit colours needs tifffile", "pip install tifffile, or save it as PNG"
+            ) from None
+        return np.asarray(tifffile.imread(io.BytesIO(data)))
+    import mitsuba as mi
+
+    previous = mi.variant()
+    if previous is None:
+        mi.set_variant("scalar_rgb")
+    try:
+        stream = mi.MemoryStream(len(data))
+        stream.write(data)
+        stream.seek(0)
+        return np.array(mi.Bitmap(stream))
+    except RuntimeError as error:
+        raise InputError("cannot read the image", file=path, field=field, got=error) from None
 
 
 def as_numbers(image: np.ndarray) -> np.ndarray:
@@ -141,6 +216,27 @@ def linear_colours(image: np.ndarray) -> np.ndarray:
 
     values = as_numbers(image) if image.dtype.kind == "f" else decode_srgb(as_numbers(image))
     return np.broadcast_to(values, (*values.shape[:2], 3)).astype(np.float32)
+
+
+def check_normals(codes: np.ndarray, path: PathLike, field: str) -> None:
+    """InputError for an image that is no normal map.
+
+    Parameters
+    ----------
+    codes : ndarray (rows, columns, 3)
+        Shares of their range: a normal is twice that less 1.
+    path : path-like
+    field : str
+    """
+    below = float((2 * codes[..., 2] - 1 < -MOST_BELOW).mean())
+    if below > MOST_BELOW:
+        raise InputError(
+            "no normal map: normals point into the surface",
+            file=path,
+            field=field,
+            got=f"{below:.3g} of the texels with a blue below one half",
+            expected="blue of at least one half",
+        )
 
 
 def texture(name: str) -> Facts:

@@ -135,10 +135,12 @@ def mesh_seams(vertices: np.ndarray, faces: np.ndarray) -> list[Seam]:
         worst = np.flatnonzero(border)[np.argmax(gap[border])]
         x, y, z = points[worst]
         there = nearest[worst]
+        far = f"are {gap[worst]:.3g} tiles apart", f" (nearest copy at z = {there[2]:.4g})"
+        apart, copy = far if np.isfinite(gap[worst]) else ("meet no copy", "")
         seams.append(
             Seam(
-                f"borders at {name} = {low:.4g} and {name} = {high:.4g} are {gap[worst]:.3g} tiles apart at "
-                f"x = {x:.4g}, y = {y:.4g}, z = {z:.4g} (nearest copy at z = {there[2]:.4g})",
+                f"borders at {name} = {low:.4g} and {name} = {high:.4g} {apart} at x = {x:.4g}, y = {y:.4g}, "
+                f"z = {z:.4g}{copy}",
                 float(gap[worst]),
             )
         )

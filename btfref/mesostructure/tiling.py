@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from btfref.mesostructure.materials import load_bsdf
+from btfref.mesostructure.vertex_texture import ATTRIBUTES
 from btfref.numerics.device_arrays import to_device
 
 if TYPE_CHECKING:
@@ -49,6 +52,11 @@ def tile_group(mesostructure: Mesostructure, bsdfs: Sequence[JitArray] | None = 
             values["vertex_normals"] = to_device(mi.Float, part.normals)
         values["vertex_texcoords"] = to_device(mi.Float, uv)
         values.update()
+        for name, numbers in part.attributes.items():
+            # Mitsuba hands attributes out in ones and threes.
+            wide = np.pad(numbers, ((0, 0), (0, 1))) if numbers.shape[1] == 2 else numbers
+            flat = np.ascontiguousarray(wide, np.float32).ravel()
+            mesh.add_attribute(ATTRIBUTES + name, wide.shape[1], flat)
         group[f"part_{index}"] = mesh
     return mi.load_dict(group)
 

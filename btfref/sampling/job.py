@@ -72,7 +72,9 @@ class Job:
         self.mesostructure = build(mesostructure, **parameters)
         with mitsuba_variant(settings.variant):
             bsdfs = [load_bsdf(part) for part in self.mesostructure.parts]
-            fallback = reason_against_surface(bsdfs) if settings.estimator == "surface" else None
+            fallback = None
+            if settings.estimator == "surface":
+                fallback = reason_against_surface(bsdfs, self.mesostructure.parts)
         if fallback is not None:
             settings = dataclasses.replace(settings, estimator="path")
         self.settings = settings
@@ -86,6 +88,8 @@ class Job:
             },
             "versions": versions((*VERSIONS, LLVM) if settings.variant.startswith("llvm") else VERSIONS),
         }
+        if self.mesostructure.ignored:
+            self.attributes["ignored"] = list(self.mesostructure.ignored)
         if fallback is not None:
             self.attributes["fallback"] = f"path instead of surface: {fallback}"
 
@@ -286,4 +290,7 @@ def fingerprint(mesostructure: Mesostructure) -> str:
                 state.update(
                     np.asarray(array, np.float32 if array.dtype.kind == "f" else np.uint32).tobytes()
                 )
+        for name, array in sorted(part.attributes.items()):
+            state.update(f"{name} {array.shape}".encode())
+            state.update(np.asarray(array, np.float32).tobytes())
     return state.hexdigest()[:32]

@@ -52,6 +52,7 @@ def write_job(path: PathLike, job: Job, only: Selection | None, plan: Plan | Non
         "mesostructure": {
             "name": made.name,
             "parameters": made.parameters,
+            "ignored": made.ignored,
             "parts": [
                 {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
                 for part in made.parts
@@ -88,7 +89,7 @@ def read_job(path: PathLike) -> tuple[Job, Selection | None, Plan | None]:
             raise InputError("a worker of another version", field="btfref", got=__version__, expected=written)
         made = data["mesostructure"]
         parts = tuple(Part(**part) for part in made["parts"])
-        mesostructure = Mesostructure(made["name"], made["parameters"], parts)
+        mesostructure = Mesostructure(made["name"], made["parameters"], parts, tuple(made["ignored"]))
         settings = SynthesisSettings(**data["settings"])
         only = data["only"] and Selection(**data["only"])
         plan = data["plan"] and Plan(**data["plan"])

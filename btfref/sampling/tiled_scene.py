@@ -39,6 +39,8 @@ class TiledScene:
     scene : mitsuba.Scene
     bsdfs : list of mitsuba.BSDF
         One per part.
+    masked : bool
+        Whether a part lets light through without turning it: shadow rays then want `transmittance`.
     """
 
     def __init__(self, mesostructure: Mesostructure, directions: ArrayLike) -> None:
@@ -60,6 +62,7 @@ class TiledScene:
         margin = self.reach + math.ceil(mesostructure.overhang)
         offsets = range(-margin, margin + 1)
         self.bsdfs = [load_bsdf(part) for part in mesostructure.parts]
+        self.masked = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in self.bsdfs)
         shapes = tiled_shapes(mesostructure, offsets, offsets, bsdfs=self.bsdfs)
         self.scene = mi.load_dict({"type": "scene", **shapes})
 
@@ -157,6 +160,49 @@ class TiledScene:
 
         state = (mi.Point3f(ray.o), mi.Bool(False), mi.Bool(active), mi.UInt32(0))
         return dr.while_loop(state, lambda origin, blocked, searching, rounds: searching, search)[1]
+
+    def transmittance(self, ray: JitArray, active: JitArray) -> JitArray:
+        """Share of light that reaches the origins of rays from the central tile through masked surfaces.
+
+        Parameters
+        ----------
+        ray : mitsuba.Ray3f
+        active : mitsuba.Bool
+
+        Returns
+        -------
+        mitsuba.Color3f
+            0 where a surface lets nothing through, 1 where there is none.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        travel, direction = self._travel(ray.d), mi.Vector3f(ray.d)
+
+        def search(
+            origin: JitArray, left: JitArray, share: JitArray, searching: JitArray, rounds: JitArray
+        ) -> tuple[JitArray, ...]:
+            part = mi.Ray3f(origin, direction)
+            part.maxt = left
+            hit = self.scene.ray_intersect(part, mi.RayFlags.All, coherent=False, active=searching)
+            found = searching & hit.is_valid()
+            through = hit.bsdf().eval_null_transmission(hit, found)
+            share = dr.select(found, share * mi.Color3f(through), share)
+            end, inside = self._wrapped(origin, direction, left)
+            origin = dr.select(found, mi.Point3f(hit.spawn_ray(direction).o), end)
+            left = dr.select(found, left - hit.t, travel)
+            searching = searching & (dr.max(share) > 0) & (found | inside) & (rounds < MAXIMUM_ROUNDS)
+            return origin, left, share, searching, rounds + 1
+
+        width = dr.width(direction)
+        state = (
+            mi.Point3f(ray.o),
+            mi.Float(travel),
+            dr.full(mi.Color3f, 1, width),
+            mi.Bool(active),
+            dr.zeros(mi.UInt32, width),
+        )
+        return dr.while_loop(state, lambda origin, left, share, searching, rounds: searching, search)[2]
 
 
 def uniforms(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Generic, TypeVar
@@ -65,7 +65,11 @@ def angles_of(name: str) -> Angles | None:
     found = _ANGLE.findall(PurePosixPath(name).stem)
     if len(found) != 4 or len({key for key, _ in found}) != 4:
         return None
-    angle = {key: float(text) for key, text in found}
+    return in_order({key: float(text) for key, text in found})
+
+
+def in_order(angle: Mapping[str, float]) -> Angles:
+    """(θ_l, φ_l, θ_v, φ_v) of angles by the names of a name's fields; φ as of `angles_of`."""
     light, view = ((angle[t], angle[p] % 360 if angle[t] else 0.0) for t, p in (("tl", "pl"), ("tv", "pv")))
     return light + view
 
@@ -73,18 +77,25 @@ def angles_of(name: str) -> Angles | None:
 def style_of(names: Iterable[str]) -> str | None:
     """How the first image with angles writes them: "spectral", "utia", "ubo", or None.
 
-    "spectral" puts the camera first, "utia" joins light first by underscores, "ubo" is anything else.
+    "spectral" puts the camera first, and has OpenEXR alone; "utia" joins light first by underscores; "ubo" is anything
+    else.
     """
     for name in names:
         stem = PurePosixPath(name).stem
         if angles_of(name) is not None:
             if re.search(r"tv[\d.]+_pv[\d.]+_tl[\d.]+_pl", stem):
-                return "spectral"
+                return "spectral" if name.lower().endswith(".exr") else "ubo"
             return "utia" if re.search(r"tl[\d.]+_pl[\d.]+_tv[\d.]+_pv", stem) else "ubo"
     return None
 
 
-def grid(names: Iterable[str], file: PathLike, *, allow_missing: bool = False) -> Grid[str]:
+def grid(
+    names: Iterable[str],
+    file: PathLike,
+    *,
+    allow_missing: bool = False,
+    angles_in: Callable[[str], Angles | None] = angles_of,
+) -> Grid[str]:
     """Views × lights of images by name.
 
     Parameters
@@ -95,6 +106,8 @@ def grid(names: Iterable[str], file: PathLike, *, allow_missing: bool = False) -
         For errors.
     allow_missing : bool
         Accept pairs without an image.
+    angles_in : callable
+        Finds the angles in a name, as `angles_of` does.
 
     Returns
     -------
@@ -107,11 +120,13 @@ def grid(names: Iterable[str], file: PathLike, *, allow_missing: bool = False) -
         No image, one pair twice, pairs missing, or directions below the horizon.
     """
     entries: dict[Angles, str] = {}
+    seen = ""
     for name in names:
-        angles = angles_of(name)
+        seen = seen or name
+        angles = angles_in(name)
         if angles is None:
             continue
-        if angles[0] > 90 or angles[2] > 90:
+        if not (0 <= angles[0] <= 90 and 0 <= angles[2] <= 90):
             raise InputError("direction below the horizon", file=file, field=name, got=angles)
         if angles in entries:
             raise InputError(
@@ -119,6 +134,10 @@ def grid(names: Iterable[str], file: PathLike, *, allow_missing: bool = False) -
             )
         entries[angles] = name
     if not entries:
+        if angles_in is not angles_of:
+            raise InputError(
+                "no image whose name is of the pattern", file=file, field="pattern", got=seen or "none"
+            )
         raise InputError("no image with tl, pl, tv and pv in its name", file=file)
     return arrange(entries, file, allow_missing=allow_missing)
 

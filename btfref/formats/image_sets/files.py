@@ -6,6 +6,7 @@ import hashlib
 import os
 import zipfile
 import zlib
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 
@@ -22,6 +23,11 @@ LARGEST_FILE = 512 << 20
 LARGEST_RATIO = 200
 
 IMAGES = (".jpg", ".jpeg", ".png", ".exr", ".hdr")
+
+
+def _hidden(parts: Sequence[str]) -> bool:
+    """Whether a name is what file managers leave behind: dot files, and what macOS packs beside them."""
+    return any(part.startswith(".") or part == "__MACOSX" for part in parts)
 
 
 class Candidate:
@@ -102,7 +108,7 @@ class _Files:
 
 
 class Folder(_Files):
-    """Files of a folder and the folders in it; links to folders are not followed."""
+    """Files of a folder and the folders in it, but for hidden ones; links to folders are not followed."""
 
     def __init__(self, path: PathLike) -> None:
         self.path = Path(path)
@@ -110,7 +116,7 @@ class Folder(_Files):
         for top, _, names in os.walk(self.path):
             for name in names:
                 entry = Path(top) / name
-                if entry.is_file():
+                if not _hidden(entry.relative_to(self.path).parts) and entry.is_file():
                     self.sizes[entry.relative_to(self.path).as_posix()] = entry.stat().st_size
             if len(self.sizes) > LARGEST_NUMBER:
                 raise InputError("too many files", file=path, expected=f"at most {LARGEST_NUMBER}")
@@ -140,7 +146,7 @@ class Folder(_Files):
 
 
 class Archive(_Files):
-    """Files of a zip archive, every name and size of which was checked before anything is unpacked."""
+    """Files of a zip archive but for hidden ones; every name and size is checked before anything is unpacked."""
 
     def __init__(self, path: PathLike) -> None:
         self.path = Path(path)
@@ -167,7 +173,7 @@ class Archive(_Files):
                 raise InputError(
                     "name that leaves the archive", file=path, field="name", got=repr(name)[:200]
                 )
-            if entry.is_dir():
+            if entry.is_dir() or _hidden(parts):
                 continue
             if entry.flag_bits & 1:
                 raise InputError("encrypted archive", file=path, field=name)

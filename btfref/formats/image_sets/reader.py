@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.formats.image_sets.angles import grid, style_of
+from btfref.formats.image_sets.angles import angles_of, grid, style_of
 from btfref.formats.image_sets.files import Archive, Candidate, Folder, files_of
+from btfref.formats.image_sets.pattern import angles_by
 from btfref.formats.source import Source
 from btfref.images import decoding
 from btfref.types import Facts, PathLike
@@ -33,7 +34,7 @@ def recogniser(style: str) -> Callable[[Candidate], bool]:
 
 
 def opener(name: str, to_linear: ToLinear, *, cosine_included: bool, scale: float) -> Callable[..., Source]:
-    """``open(path, *, allow_missing=False)`` of a format without options of its own; as `image_source`."""
+    """``open(path, *, allow_missing=False, pattern=None)`` of a format without other options; as `image_source`."""
     return partial(image_source, name=name, to_linear=to_linear, cosine_included=cosine_included, scale=scale)
 
 
@@ -45,6 +46,7 @@ def image_source(
     cosine_included: bool,
     scale: float,
     allow_missing: bool = False,
+    pattern: str | None = None,
     facts: Mapping[str, Any] | None = None,
 ) -> Source:
     """A source of one image per pair.
@@ -61,6 +63,8 @@ def image_source(
     cosine_included, scale
         As of `Source`, where no note of ours says otherwise.
     allow_missing : bool
+    pattern : str, optional
+        Of the names, see `btfref.formats.image_sets.pattern.angles_by`.
     facts : dict, optional
 
     Returns
@@ -68,7 +72,8 @@ def image_source(
     Source
     """
     files = files_of(path)
-    found = grid(files.images(), path, allow_missing=allow_missing)
+    angles_in = angles_of if pattern is None else angles_by(pattern)
+    found = grid(files.images(), path, allow_missing=allow_missing, angles_in=angles_in)
     first = next(iter(found.images.values()))
     kind, rows, columns, channels = decoding.header(files.read(first), files.where(first))
     note = _note(files)

@@ -58,7 +58,13 @@ def _weights(names: tuple[str, ...]) -> np.ndarray:
 
 def _to_linear(pixels: np.ndarray, channels: tuple[str, ...], where: PathLike) -> np.ndarray:
     if pixels.dtype == np.uint8 or set(channels) == {"R", "G", "B"}:
-        raise InputError("picture without wavelengths", file=where, field="channels", got=", ".join(channels))
+        raise InputError(
+            "picture without wavelengths",
+            file=where,
+            field="channels",
+            got=", ".join(channels),
+            expected="wavelengths, or --format ubo",
+        )
     wavelengths(channels, where)
     return pixels[..., pick(channels, channels, where)] @ _weights(channels)
 
@@ -68,5 +74,5 @@ FORMAT = Format(
     "Bonn SPECTRAL folders of OpenEXR pictures",
     recogniser("spectral"),
     opener("spectral", _to_linear, cosine_included=False, scale=1.0),
-    options=frozenset({"allow_missing"}),
+    options=frozenset({"allow_missing", "pattern"}),
 )

@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 GAMMA = 2.2
 
 
-def open_ubo(path: PathLike, *, allow_missing: bool = False, gamma: float = GAMMA) -> Source:
+def open_ubo(
+    path: PathLike, *, allow_missing: bool = False, gamma: float = GAMMA, pattern: str | None = None
+) -> Source:
     """Open a folder or zip archive.
 
     Parameters
@@ -32,6 +34,8 @@ def open_ubo(path: PathLike, *, allow_missing: bool = False, gamma: float = GAMM
         Accept pairs without a picture.
     gamma : float
         Exponent that makes 8-bit codes linear.
+    pattern : str, optional
+        Of the names, see `btfref.formats.image_sets.pattern.angles_by`.
 
     Returns
     -------
@@ -54,6 +58,7 @@ def open_ubo(path: PathLike, *, allow_missing: bool = False, gamma: float = GAMM
         cosine_included=True,
         scale=1.0,
         allow_missing=allow_missing,
+        pattern=pattern,
         facts={"gamma": gamma},
     )
 
@@ -80,7 +85,7 @@ FORMAT = Format(
     "UBO2003 and ATRIUM folders and archives of pictures",
     recogniser("ubo"),
     open_ubo,
-    options=frozenset({"allow_missing", "gamma"}),
+    options=frozenset({"allow_missing", "gamma", "pattern"}),
     export=export,
     settings=frozenset({"image", "gamma", "quality", "scale", "moved"}),
 )

@@ -74,7 +74,7 @@ FORMAT = Format(
     "UTIA folders and archives of pictures",
     recogniser("utia"),
     opener("utia", _to_linear, cosine_included=False, scale=SCALE),
-    options=frozenset({"allow_missing"}),
+    options=frozenset({"allow_missing", "pattern"}),
     export=export,
     settings=frozenset({"image", "scale", "moved"}),
 )

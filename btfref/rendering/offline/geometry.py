@@ -101,6 +101,7 @@ def render_geometry(
     """
     import time
 
+    from btfref.mesostructure.materials import load_bsdf
     from btfref.mesostructure.tiling import tiled_shapes
     from btfref.provenance import versions
     from btfref.sampling.variant import mitsuba_variant, no_collection
@@ -119,10 +120,13 @@ def render_geometry(
         low = np.floor(plane.low - geometry.overhang + _SLACK).astype(int)
         high = np.ceil(plane.high + geometry.overhang - _SLACK).astype(int)
         to_world = mi.ScalarTransform4f(plane.matrix)
-        shapes = tiled_shapes(geometry, range(low[0], high[0]), range(low[1], high[1]), to_world)
+        bsdfs = [load_bsdf(part) for part in geometry.parts]
+        shapes = tiled_shapes(geometry, range(low[0], high[0]), range(low[1], high[1]), to_world, bsdfs)
         lights = {f"light_{i}": _light(light) for i, light in enumerate(description.lights)}
         made = mi.load_dict({"type": "scene", "sensor": _sensor(mi, description.camera), **lights, **shapes})
-        integrator = mi.load_dict({"type": "path", "max_depth": int(depth)})
+        # The shadow rays of Mitsuba's path stop at masks, those of volpath do not.
+        masked = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs)
+        integrator = mi.load_dict({"type": "volpath" if masked else "path", "max_depth": int(depth)})
         # Largest total not beyond spp that splits into equal rounds: their spread is then the variance.
         per_round = spp // rounds
         mean = np.zeros((description.camera.height, description.camera.width, 3))

@@ -108,8 +108,8 @@ class PathEstimator:
 
     Notes
     -----
-    Build and use it inside one `mitsuba_variant` block. Light that reaches a point through delta lobes
-    (smooth glass) is missing, as in every path tracer with delta lights.
+    Build and use it inside one `mitsuba_variant` block. Masks let the light through. Light that reaches a point
+    through delta lobes that turn it (smooth glass) is missing, as in every path tracer with delta lights.
     """
 
     key = "path"
@@ -248,7 +248,10 @@ class PathEstimator:
             value = throughput * bsdf.eval(context, interaction, interaction.to_local(w_light), active)
             lit = active & (dr.max(value) > 0)
             ray = interaction.spawn_ray(w_light)
-            lit &= ~self.tiles.occluded(ray, lit)
+            if self.tiles.masked:
+                value *= self.tiles.transmittance(ray, lit)
+            else:
+                lit &= ~self.tiles.occluded(ray, lit)
             index = dr.fma(i, 3 * n_lanes, mine)
             for channel in range(3):
                 at = index + channel * n_lanes

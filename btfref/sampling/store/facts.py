@@ -46,5 +46,6 @@ def store_facts(store: BTFStore) -> Facts:
         "parent": store.attributes.get("parent", {}),
         "seed": store.attributes.get("seed"),
         "versions": store.attributes.get("versions", {}),
+        **{key: store.attributes[key] for key in ("fallback", "ignored") if key in store.attributes},
         "attributes": store.attributes,
     }

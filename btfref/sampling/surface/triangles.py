@@ -211,7 +211,8 @@ def density(triangles: Triangles, views: np.ndarray, visible: np.ndarray, varied
     spread = (varied * triangles.area).sum() / total
     if spread > 0:
         wanted = (1 - VARIED) * wanted + VARIED * mean / spread * varied
-    around = np.bincount(key, wanted * triangles.area) / np.bincount(key, triangles.area)
+    # Cells of faces without area hold none.
+    around = np.bincount(key, wanted * triangles.area) / np.maximum(np.bincount(key, triangles.area), 1e-300)
     wanted = 0.5 * (wanted + around[key])
     result = wanted + FLOOR * mean
     hidden = triangles.part == ABSORBER

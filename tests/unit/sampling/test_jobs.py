@@ -46,6 +46,27 @@ def test_a_job_comes_back_from_its_file(tmp_path):
 
 
 @pytest.mark.usefixtures("llvm")
+def test_numbers_of_vertices_and_what_was_ignored_come_back_as_well(tmp_path):
+    from gltf_files import gltf
+
+    from btfref.sampling.job import fingerprint
+    from btfref.sampling.job_file import read_job, write_job
+
+    colours = np.random.default_rng(0).random((4, 4))
+    file = gltf(tmp_path / "m.glb", {}, COLOR_0=colours, top={"animations": [{}]})
+    job = make_job(file, None, {**SETTINGS, "estimator": "surface"})
+    write_job(tmp_path / "job", job, None, None)
+    again, *_ = read_job(tmp_path / "job")
+    assert fingerprint(again.mesostructure) == fingerprint(job.mesostructure)
+    # A worker gets the estimator that was chosen: why is for the store.
+    assert "vertices" in job.attributes["fallback"]
+    assert again.settings.estimator == "path"
+    assert again.attributes["ignored"] == job.attributes["ignored"] != []
+    other = make_job(gltf(tmp_path / "m.glb", {}, COLOR_0=colours[::-1]), None, SETTINGS)
+    assert fingerprint(other.mesostructure) != fingerprint(job.mesostructure)
+
+
+@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -1,0 +1,1 @@
+"""Readers of meshes: triangles with everything that their materials ask of them."""
