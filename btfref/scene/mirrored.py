@@ -54,8 +54,13 @@ def mirrored_meshes(meshes: Sequence[MeshDescription]) -> list[str]:
     return [
         mesh.name
         for mesh in meshes
-        if mesh.material is not None and (mesh.hands() * mesh.material.turn.hand < 0).any()
+        if mesh.material is not None and (_hands(mesh) * mesh.material.turn.hand < 0).any()
     ]
+
+
+def _hands(mesh: MeshDescription) -> np.ndarray:
+    """Signs of det(∂p/∂u, ∂p/∂v, n) that occur."""
+    return mesh.hands() if mesh.quadric is None else np.array(np.prod(mesh.quadric.sides))
 
 
 def line(names: Sequence[str]) -> str:

@@ -49,6 +49,10 @@ EDGE = 1e-3
 #: Turn of the shading frame, in radians, below which the neighbouring triangle shows the same value.
 TURN = 1e-4
 
+#: Turn of the frame of one sphere, disk or cylinder between such rays that is none of its curvature: at a pole, or the
+#: centre of a disk, tangents take every direction.
+POLE = 1e-3
+
 
 def pixel_classes(
     scene: SceneLike,
@@ -64,12 +68,12 @@ def pixel_classes(
     A sample *may be seen otherwise* by another renderer where rays half a step of 1/256 pixel beside it, by which
     rasterizers snap vertices, hit something else: nothing, another shape, a surface at another depth, or the other side
     of the shading normal, at whose horizon B jumps to zero; and where rays within float32 rounding hit a triangle with
-    another frame or other texture coordinates, since ∂p/∂u is constant on a triangle and B jumps there. A pixel with
-    such a sample is *silhouette*. An *edge* pixel has none, but its samples or those of its eight neighbours meet an
-    edge: they mix hit and miss or several shapes, the surface jumps in depth between two of them (a fold in front of
-    the cloth itself), or turns away from the view. *Mesostructure* are other pixels in which a material with a
-    geometry of its own (a g-BRDF) jumps within `HIT` of a sample, under one of the scene's delta lights. All other
-    pixels that are hit are *interior*.
+    another frame or other texture coordinates, since ∂p/∂u is constant on a triangle and B jumps there, or the pole or
+    the seam of a sphere, disk or cylinder. A pixel with such a sample is *silhouette*. An *edge* pixel has none, but
+    its samples or those of its eight neighbours meet an edge: they mix hit and miss or several shapes, the surface
+    jumps in depth between two of them (a fold in front of the cloth itself), or turns away from the view.
+    *Mesostructure* are other pixels in which a material with a geometry of its own (a g-BRDF) jumps within `HIT` of a
+    sample, under one of the scene's delta lights. All other pixels that are hit are *interior*.
 
     Parameters
     ----------
@@ -240,6 +244,7 @@ def _seen(scene: JitArray, offset: tuple[float | JitArray, float | JitArray]) ->
     seen = {
         "shape": dr.select(si.is_valid(), dr.reinterpret_array(mi.UInt32, si.shape), 0),
         "triangle": si.prim_index,
+        "mesh": si.is_valid() & si.shape.is_mesh(),
         "distance": si.t,
         "point": si.p,
         "normal": si.n,
@@ -265,10 +270,12 @@ def _seen_otherwise(one: dict[str, JitArray], other: dict[str, JitArray], footpr
 
 
 def _in_another_frame(one: dict[str, JitArray], other: dict[str, JitArray]) -> JitArray:
-    """Whether a ray beside hits a triangle whose shading frame or texture coordinates are not the continued ones."""
+    """Whether a ray beside hits a place whose shading frame or texture coordinates are not the continued ones."""
     import drjit as dr
 
     turn = dr.norm(other["tangent"] - one["tangent"]) + dr.norm(other["shading"] - one["shading"])
     jump = dr.max(dr.abs(other["uv"] - one["uv"])) > SEAM
     both = (one["shape"] > 0) & (other["shape"] > 0)
-    return both & (one["triangle"] != other["triangle"]) & ((turn > TURN) | jump)
+    # Triangles that meet, or a pole and the seam of a shape that is one piece.
+    apart = one["mesh"] & (one["triangle"] != other["triangle"]) & ((turn > TURN) | jump)
+    return both & (apart | (~one["mesh"] & ((turn > POLE) | jump)))

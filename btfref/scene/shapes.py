@@ -9,6 +9,7 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.sphere.frames import Turn, nearest_turn
+from btfref.scene.quadrics import KINDS, Quadric
 from btfref.types import JitArray, PathLike
 
 #: Segments of a full turn of a tessellated sphere, disk or cylinder: chords lie within 4e-5 radii of the
@@ -81,6 +82,8 @@ class MeshDescription:
         Plugin of the BSDF, for messages.
     to_world : ndarray, shape (4, 4)
         The shape's own transform, as written in the scene (the positions have it already).
+    quadric : Quadric or None
+        Of a sphere, disk or cylinder, whose triangles are an approximation.
     """
 
     name: str
@@ -93,6 +96,7 @@ class MeshDescription:
     material: BtfMaterial | None
     bsdf: str
     to_world: np.ndarray
+    quadric: Quadric | None = None
 
     @property
     def btf(self) -> BtfMaterial:
@@ -207,7 +211,7 @@ def triangles_of(shape: JitArray, node: JitArray, *, file: PathLike) -> dict[str
     Returns
     -------
     dict
-        ``positions``, ``normals``, ``uv``, ``faces``, ``flip``, ``to_world`` of :class:`MeshDescription`.
+        ``positions``, ``normals``, ``uv``, ``faces``, ``flip``, ``to_world``, ``quadric`` of :class:`MeshDescription`.
 
     Raises
     ------
@@ -245,12 +249,15 @@ def triangles_of(shape: JitArray, node: JitArray, *, file: PathLike) -> dict[str
     normals = _unit(normals @ np.linalg.inv(matrix[:3, :3]))
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = faces[:, ::-1]
+    flip = "flip_normals" in props and bool(props["flip_normals"])
+    quadric = Quadric.of(plugin, matrix, flip) if plugin in KINDS else None
     return common | {
         "positions": positions @ matrix[:3, :3].T + matrix[:3, 3],
         "normals": normals,
         "uv": uv,
         "faces": faces,
-        "flip": "flip_normals" in props and bool(props["flip_normals"]),
+        "flip": quadric.flip if quadric else flip,
+        "quadric": quadric,
     }
 
 

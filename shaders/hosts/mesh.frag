@@ -1,9 +1,11 @@
 // Provides the radiance towards the camera under directional and point lights and an environment, without cast shadows.
 // Expects a representation, the tables of hosts/mesh.vert, the camera's rays, the lights and the material.
 
+#include "lib/surface/film.glsl"
 #include "lib/surface/frame.glsl"
 #include "lib/light/lights.glsl"
 #include "lib/surface/lod.glsl"
+#include "lib/surface/quadric.glsl"
 #include "lib/surface/triangle_table.glsl"
 #include "representation"
 #include "environment"
@@ -13,8 +15,6 @@ uniform vec3 camera_origin;
 uniform vec3 ray_corner;    // towards film coordinate (0, 0), the top left corner
 uniform vec3 ray_right;     // change per pixel to the right
 uniform vec3 ray_down;      // change per pixel downwards
-uniform vec2 film_offset;   // from gl_FragCoord.x and height - gl_FragCoord.y to the film coordinate of the sample
-uniform float film_height;
 uniform vec3 uv_row0;       // texture transform: u' = dot(uv_row0, (u, v, 1))
 uniform vec3 uv_row1;
 uniform vec3 uv_turn;       // of the local frame by the texture transform: cosine, sine, -1 where it mirrors
@@ -25,7 +25,7 @@ uniform int pass;           // number of this picture among those that add up
 #ifdef SEEN
 uniform highp sampler2D seen;  // what each pixel sees, from hosts/seen.frag
 uniform int mesh;              // that is drawn
-#else
+#elif !defined(QUADRIC)
 flat in int triangle;
 #endif
 
@@ -41,9 +41,20 @@ void main() {
         return;
     }
 #endif
-    vec2 film = vec2(gl_FragCoord.x, film_height - gl_FragCoord.y) + film_offset;
+    vec2 film = film_coordinate(gl_FragCoord);
     vec3 direction = normalize(ray_corner + film.x * ray_right + film.y * ray_down);
+#ifdef QUADRIC
+    SurfacePoint point;
+    float window;
+    if (!quadric_intersect(film, point, window)) {
+        discard;
+    }
+#ifndef SEEN
+    gl_FragDepth = window;
+#endif
+#else
     SurfacePoint point = scene_intersect(triangles, triangle, camera_origin, direction);
+#endif
     mat3 to_local = frame_turned(shading_frame(point.normal, point.dp_du, point.side), uv_turn);
     vec3 uv1 = vec3(point.uv, 1.0);
     vec2 uv = vec2(dot(uv_row0, uv1), dot(uv_row1, uv1));

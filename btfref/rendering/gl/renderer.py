@@ -18,7 +18,7 @@ from btfref import representations
 from btfref.errors import GRID, BtfrefError, InputError, refuse_above
 from btfref.rendering import RenderResult
 from btfref.rendering.environment_light.lighting import lighting_of
-from btfref.rendering.gl import device
+from btfref.rendering.gl import device, quadrics
 from btfref.rendering.gl.raster import (
     clip_planes,
     light_uniforms,
@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 #: Gives the representation of a file.
 LoadFile = Callable[[str], "Representation"]
 
-#: Of what is shown: file, texel filter, and the mesh where each has light of its own.
-Key = tuple[str, str | None, int | None]
+#: Of what is shown: file, texel filter, the mesh where each has light of its own, and whether it is on a quadric.
+Key = tuple[str, str | None, int | None, bool]
 
 
 def realtime(
@@ -207,8 +207,8 @@ class Renderer:
         if lighting is None:
             self._lighting = lighting_of(scene)
         self._light_facts: Facts = {}
-        self._depth: tuple[JitArray, JitArray] | None = None
-        self._seen: tuple[JitArray, JitArray, JitArray, JitArray] | None = None
+        self._hosts: dict[tuple[str, bool], tuple[JitArray, JitArray]] = {}
+        self._seen: tuple[JitArray, JitArray] | None = None
         self._counting = {"COUNT_FETCHES": 1} if count_fetches else {}
         try:
             for number, mesh in enumerate(scene.meshes):
@@ -230,7 +230,9 @@ class Renderer:
     def _add(self, number: int, mesh: MeshDescription, load_file: LoadFile) -> None:
         material = mesh.btf
         own = number if self._lighting is not None and self._lighting.per_mesh else None
-        key = (material.filename, material.filter_type, own)
+        # Matrices of transfer belong to triangles.
+        exact = mesh.quadric is not None and own is None
+        key = (material.filename, material.filter_type, own, exact)
         if key not in self._shown:
             rep = load_file(material.filename)
             light = None
@@ -245,40 +247,53 @@ class Renderer:
             if by_pixel:
                 defines["SEEN"] = 1
                 self._what_is_seen()
-            vertex = "hosts/screen.vert" if by_pixel else "hosts/mesh.vert"
-            program = shown.program(self.ctx, vertex, "hosts/mesh.frag", defines=defines)
+            if exact:
+                defines["QUADRIC"] = 1
+            vertex = "quadric" if exact else "screen" if by_pixel else "mesh"
+            program = shown.program(self.ctx, f"hosts/{vertex}.vert", "hosts/mesh.frag", defines=defines)
             self._own(program), self._own(shown)
             self._shown[key] = shown, program, self._own(self.ctx.vertex_array(program, [])), light
-        table = self._own(device.upload(self.ctx, triangle_table(mesh), "triangles"))
+        table = None if exact else self._own(device.upload(self.ctx, triangle_table(mesh), "triangles"))
         self._meshes.append((mesh, key, table))
 
-    def _what_is_seen(self) -> tuple[JitArray, JitArray, JitArray, JitArray]:
+    def _what_is_seen(self) -> tuple[JitArray, JitArray]:
         """What each pixel sees: passes that add up shade pixels, not triangles of less than a pixel anew each time."""
         if self._seen is None:
             size = (self.camera.width, self.camera.height)
             texture = self._own(self.ctx.texture(size, 2, dtype="f4"))
             target = self._own(self.ctx.framebuffer([texture], self._own(self.ctx.depth_renderbuffer(size))))
-            program = self._own(device.compile_program(self.ctx, "hosts/mesh.vert", "hosts/seen.frag"))
-            self._seen = texture, target, program, self._own(self.ctx.vertex_array(program, []))
+            self._seen = texture, target
         return self._seen
 
     def _fill_seen(self, common: dict[str, Any]) -> None:
         """Find what each pixel sees, in all meshes."""
-        _, target, program, vertices = self._what_is_seen()
+        _, target = self._what_is_seen()
         target.use()
         target.clear(0.0, 0.0, 0.0, 0.0)
-        for number, (mesh, _, table) in enumerate(self._meshes):
-            device.bind(program, {"triangles": table})
-            device.set_uniforms(program, {**common, "mesh": number})
-            vertices.render(self.ctx.TRIANGLES, vertices=3 * len(mesh.faces))
+        self._draw_all("hosts/seen.frag", common)
         self._target.use()
 
-    def _depth_program(self) -> tuple[JitArray, JitArray]:
-        """Black surfaces: what fills the depth buffer before pictures are added up."""
-        if self._depth is None:
-            program = self._own(device.compile_program(self.ctx, "hosts/mesh.vert", "hosts/depth.frag"))
-            self._depth = program, self._own(self.ctx.vertex_array(program, []))
-        return self._depth
+    def _draw_all(self, fragment: str, common: dict[str, Any]) -> None:
+        """Draw all surfaces by a host that knows no material."""
+        for number, (mesh, _, table) in enumerate(self._meshes):
+            exact = table is None
+            if (fragment, exact) not in self._hosts:
+                vertex, defines = ("quadric", {"QUADRIC": 1}) if exact else ("mesh", {})
+                made = device.compile_program(self.ctx, f"hosts/{vertex}.vert", fragment, defines=defines)
+                self._hosts[fragment, exact] = self._own(made), self._own(self.ctx.vertex_array(made, []))
+            program, vertices = self._hosts[fragment, exact]
+            device.bind(program, {} if exact else {"triangles": table})
+            device.set_uniforms(program, {**common, **self._surface(mesh, table, common), "mesh": number})
+            vertices.render(self.ctx.TRIANGLES, vertices=quadrics.VERTICES if exact else 3 * len(mesh.faces))
+
+    def _surface(
+        self, mesh: MeshDescription, table: JitArray | None, common: dict[str, Any], *, adds: bool = False
+    ) -> dict[str, Any]:
+        """Uniforms of a shape that has no table of triangles."""
+        if table is not None or mesh.quadric is None:
+            return {}
+        clip, planes = common["world_to_clip"].T, (self._near, self._far)
+        return quadrics.quadric_uniforms(mesh.quadric, self.camera, clip, planes, adds=adds)
 
     def draw(self, offset: tuple[float, float] = (0.5, 0.5), *, share: float = 1.0) -> float:
         """Draw a frame.
@@ -316,27 +331,32 @@ class Renderer:
         start = time.perf_counter()
         query = ctx.query(time=True)
         with query:
-            if any(light is not None and len(light.passes) > 1 for *_, light in self._shown.values()):
+            adds = any(light is not None and len(light.passes) > 1 for *_, light in self._shown.values())
+            if adds:
                 if self._seen is not None:
                     self._fill_seen(common)
                 self._fill_depth(common)
             for index, (mesh, key, table) in enumerate(self._meshes):
                 shown, program, vertices, light = self._shown[key]
-                tables, by_pixel = {**shown.textures, "triangles": table}, "seen" in program
+                tables, by_pixel = dict(shown.textures), "seen" in program
+                if table is not None:
+                    tables["triangles"] = table
                 if by_pixel:
                     tables["seen"] = self._what_is_seen()[0]
                     ctx.depth_func, self._target.depth_mask = ">", False
                 device.bind(program, tables)
                 own = material_uniforms(mesh.btf, shown.texels, share * camera.pixel_angle)
+                own |= self._surface(mesh, table, common, adds=adds)
                 device.set_uniforms(program, {**common, **own, "mesh": index})
                 passes: Sequence[Facts] = ({},) if light is None else light.passes
-                counts = [len(mesh.faces)] * len(passes)
+                whole = quadrics.VERTICES if table is None else 3 if by_pixel else 3 * len(mesh.faces)
+                counts = [whole] * len(passes)
                 if light is not None and light.bins is not None and light.transfer is not None:
-                    counts = np.diff(light.bins).tolist()
+                    counts = (3 * np.diff(light.bins)).tolist()
                     device.set_uniforms(program, {"transfer_components": light.transfer.table.shape[3]})
                 for number, (values, count) in enumerate(zip(passes, counts, strict=True)):
                     device.set_uniforms(program, {**values, "pass": number})
-                    vertices.render(ctx.TRIANGLES, vertices=3 if by_pixel else 3 * count)
+                    vertices.render(ctx.TRIANGLES, vertices=count)
                 if by_pixel:
                     ctx.depth_func, self._target.depth_mask = "<=", True
         ctx.depth_func = "<"
@@ -360,11 +380,7 @@ class Renderer:
     def _fill_depth(self, common: dict[str, Any]) -> None:
         """Draw all surfaces black; what follows adds to what is nearest."""
         ctx = self.ctx
-        program, vertices = self._depth_program()
-        for mesh, _, table in self._meshes:
-            device.bind(program, {"triangles": table})
-            device.set_uniforms(program, common)
-            vertices.render(ctx.TRIANGLES, vertices=3 * len(mesh.faces))
+        self._draw_all("hosts/depth.frag", common)
         ctx.depth_func = "<="
         ctx.enable(ctx.BLEND)
         ctx.blend_func = ctx.ONE, ctx.ONE

@@ -45,9 +45,12 @@ SHAPES = {
 
 
 STRETCHES = {"": [1, 1, 1], "stretched": [1, 2, 0.5], "mirrored": [-1, 1, 1]}
-#: Mitsuba's round shapes allow rotations, translations and uniform scales only.
+#: Mitsuba's round shapes allow rotations, translations, mirrors and uniform scales only.
 CASES = [
-    (name, how) for name in SHAPES for how in STRETCHES if not how or name.startswith(("rectangle", "cube"))
+    (name, how)
+    for name in SHAPES
+    for how in STRETCHES
+    if how != "stretched" or name.startswith(("rectangle", "cube"))
 ]
 
 
