@@ -117,6 +117,11 @@ def run(args: Namespace) -> int:
             from btfref.scene.mirrored import line
 
             emit(line(meta["mirrored"]))
+        for note in meta["notes"]:
+            emit(f"note: {note}")
+        if "area_light_points" in meta:
+            count, error = meta["area_light_points"], meta["area_light_error"]
+            emit(f"area lights: {count} points, estimated error {100 * error:.2g} %")
         if "estimated_error" in meta:
             number = meta.get("environment_lights", meta.get("order"))
             kind = "lights" if "environment_lights" in meta else "bands"

@@ -165,6 +165,7 @@ def demand(
     """
     from btfref.scene.description import read_scene
     from btfref.scene.hits import surfaces
+    from btfref.scene.instances import drawn_shapes
     from btfref.scene.loading import loaded
 
     if description is None:
@@ -181,8 +182,9 @@ def demand(
         if margin is None:
             beside = int(made.sensors()[0].film().crop_size()[0]), min(1.0, 2 / grid)
         camera, angle = description.camera, description.camera.pixel_angle / grid
+        shapes = drawn_shapes(made, [mesh.where for mesh in description.meshes])
         for number, surface in enumerate(surfaces(made, grid)):
-            for mesh, one in zip(description.meshes, made.shapes(), strict=True):
+            for mesh, one in zip(description.meshes, shapes, strict=True):
                 if mesh.material is not None:
                     wanted[mesh.material.filename].add(surface, one, mesh.material, camera, angle, beside)
             if progress is not None:

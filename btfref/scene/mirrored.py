@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from btfref.scene.camera import film_rays
+from btfref.scene.instances import every_shape
 from btfref.types import JitArray
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def seen_mirrored(scene: JitArray) -> list[str]:
     from mitsuba_plugins.lib.frame import hand_of
     from mitsuba_plugins.protocol import shown_by
 
-    turns = [(shape, {one.turn.hand for one in shown_by(shape.bsdf())}) for shape in scene.shapes()]
+    turns = [(shape, {one.turn.hand for one in shown_by(shape.bsdf())}) for shape in every_shape(scene)]
     if not any(hands for _, hands in turns):
         return []
     si = scene.ray_intersect(film_rays(scene.sensors()[0], (0.5, 0.5))[0])

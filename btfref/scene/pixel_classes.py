@@ -8,6 +8,7 @@ import numpy as np
 
 from btfref.conventions import PixelClass
 from btfref.scene.camera import film_rays, grid_offsets
+from btfref.scene.instances import every_shape
 from btfref.scene.lights import is_delta
 from btfref.scene.loading import loaded
 from btfref.types import JitArray, SceneLike
@@ -126,7 +127,7 @@ def _displaced_edges(scene: JitArray, grid: int) -> np.ndarray | bool:
 
     from mitsuba_plugins.protocol import is_displaced
 
-    if not any(is_displaced(shape.bsdf()) for shape in scene.shapes()):
+    if not any(is_displaced(shape.bsdf()) for shape in every_shape(scene)):
         return False
     lights = [light for light in scene.emitters() if is_delta(light)]
     sensor = scene.sensors()[0]
@@ -241,8 +242,10 @@ def _seen(scene: JitArray, offset: tuple[float | JitArray, float | JitArray]) ->
 
     ray, _ = film_rays(scene.sensors()[0], offset)
     si = scene.ray_intersect(ray)
+    # Two instances show one shape: it takes both numbers.
+    number = dr.reinterpret_array(mi.UInt32, si.shape) + (dr.reinterpret_array(mi.UInt32, si.instance) << 16)
     seen = {
-        "shape": dr.select(si.is_valid(), dr.reinterpret_array(mi.UInt32, si.shape), 0),
+        "shape": dr.select(si.is_valid(), number, 0),
         "triangle": si.prim_index,
         "mesh": si.is_valid() & si.shape.is_mesh(),
         "distance": si.t,

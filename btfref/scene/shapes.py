@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.sphere.frames import Turn, nearest_turn
+from btfref.scene.instances import Where
 from btfref.scene.quadrics import KINDS, Quadric
 from btfref.types import JitArray, PathLike
 
@@ -81,8 +84,12 @@ class MeshDescription:
     bsdf : str
         Plugin of the BSDF, for messages.
     to_world : ndarray, shape (4, 4)
-        The shape's own transform, as written in the scene (the positions have it already).
-    quadric : Quadric or None
+        The shape's own transform, as written in the scene, and its instance's (the positions have it already).
+    where : btfref.scene.instances.Where
+        Which of Mitsuba's shapes it is.
+    emission : ndarray, shape (3,)
+        Radiance of its own light on the side of its shading normal, in W/(m² sr).
+    quadric : btfref.scene.quadrics.Quadric or None
         Of a sphere, disk or cylinder, whose triangles are an approximation.
     """
 
@@ -96,7 +103,14 @@ class MeshDescription:
     material: BtfMaterial | None
     bsdf: str
     to_world: np.ndarray
+    where: Where = Where(0)
+    emission: np.ndarray = field(default_factory=lambda: np.zeros(3))
     quadric: Quadric | None = None
+
+    @property
+    def only_emits(self) -> bool:
+        """Whether it is a light without a material: Mitsuba then makes it black."""
+        return self.material is None and self.bsdf == "none" and bool(np.any(self.emission > 0))
 
     @property
     def btf(self) -> BtfMaterial:
@@ -197,7 +211,9 @@ def _unit(v: np.ndarray) -> np.ndarray:
     return v / np.where(length > 0, length, 1.0)
 
 
-def triangles_of(shape: JitArray, node: JitArray, *, file: PathLike) -> dict[str, Any]:
+def triangles_of(
+    shape: JitArray, node: JitArray, *, file: PathLike, name: str, outer: np.ndarray
+) -> dict[str, Any]:
     """Vertices of a shape, read from the instantiated mesh or tessellated.
 
     Parameters
@@ -207,6 +223,10 @@ def triangles_of(shape: JitArray, node: JitArray, *, file: PathLike) -> dict[str
     node : mitsuba.parser.SceneNode
     file : str
         Scene and line, for messages.
+    name : str
+        Of the shape, likewise.
+    outer : ndarray, shape (4, 4)
+        Transform of the instance that shows the shape.
 
     Returns
     -------
@@ -221,22 +241,32 @@ def triangles_of(shape: JitArray, node: JitArray, *, file: PathLike) -> dict[str
     import mitsuba as mi
 
     props = node.props
-    plugin, name = props.plugin_name(), shape.id()
-    to_world = np.array(props["to_world"].matrix, float) if "to_world" in props else np.eye(4)
+    plugin = props.plugin_name()
+    to_world = outer @ (np.array(props["to_world"].matrix, float) if "to_world" in props else np.eye(4))
     common = {"to_world": to_world}
     if shape.is_mesh() and plugin not in _TESSELLATIONS:
         if not shape.has_vertex_texcoords():
             raise InputError("the shape has no texture coordinates", file=file, field=name, got=plugin)
+        if plugin == "obj":
+            refuse_partial_uv(props["filename"], scene=file, name=name)
         arrays = mi.traverse(shape)
-        normals = None
+        normals, flip = None, bool(shape.has_flipped_normals())
+        positions = np.array(arrays["vertex_positions"]).reshape(-1, 3)
         if shape.has_vertex_normals():
             normals = np.array(arrays["vertex_normals"]).reshape(-1, 3)
+        if not np.array_equal(outer, np.eye(4)):
+            positions = positions @ outer[:3, :3].T + outer[:3, 3]
+            if normals is None:
+                # A mirror turns the order of corners round, and Mitsuba's normals of instances not.
+                flip ^= bool(np.linalg.det(outer[:3, :3]) < 0)
+            else:
+                normals = _unit(normals @ np.linalg.inv(outer[:3, :3]))
         return common | {
-            "positions": np.array(arrays["vertex_positions"]).reshape(-1, 3),
+            "positions": positions,
             "normals": normals,
             "uv": np.array(arrays["vertex_texcoords"]).reshape(-1, 2),
             "faces": np.array(arrays["faces"]).reshape(-1, 3).astype(np.int64),
-            "flip": bool(shape.has_flipped_normals()),
+            "flip": flip,
         }
     if plugin not in _TESSELLATIONS:
         known = ", ".join(["meshes", *_TESSELLATIONS])
@@ -250,7 +280,8 @@ def triangles_of(shape: JitArray, node: JitArray, *, file: PathLike) -> dict[str
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = faces[:, ::-1]
     flip = "flip_normals" in props and bool(props["flip_normals"])
-    quadric = Quadric.of(plugin, matrix, flip) if plugin in KINDS else None
+    own = np.linalg.solve(outer, matrix)
+    quadric = Quadric.of(plugin, own, flip).moved(outer) if plugin in KINDS else None
     return common | {
         "positions": positions @ matrix[:3, :3].T + matrix[:3, 3],
         "normals": normals,
@@ -259,6 +290,43 @@ def triangles_of(shape: JitArray, node: JitArray, *, file: PathLike) -> dict[str
         "flip": quadric.flip if quadric else flip,
         "quadric": quadric,
     }
+
+
+#: Faces of an OBJ file, one with texture coordinates, and a corner without.
+_FACE = re.compile(rb"^[ \t]*f[ \t][^\r\n#]*", re.MULTILINE)
+_UV_CORNER = re.compile(rb"^[ \t]*f[ \t][^\r\n#]*?\d/-?\d", re.MULTILINE)
+_BARE_CORNER = re.compile(rb"[ \t]-?\d+(?://-?\d+|/{0,2})(?=\s|$)")
+
+
+def refuse_partial_uv(file: PathLike, *, scene: PathLike, name: str) -> None:
+    """Refuse a Wavefront OBJ some of whose faces have texture coordinates, and others not: Mitsuba makes them up.
+
+    Parameters
+    ----------
+    file : path-like
+        The OBJ.
+    scene : str
+        Scene and line, for the message.
+    name : str
+        Of the shape.
+
+    Raises
+    ------
+    InputError
+    """
+    if not Path(file).is_file():
+        return  # Mitsuba says so
+    data = Path(file).read_bytes()
+    if not _UV_CORNER.search(data):
+        return  # no face has them: not for this message
+    if found := next((face for face in _FACE.finditer(data) if _BARE_CORNER.search(face[0])), None):
+        line = data.count(b"\n", 0, found.start()) + 1
+        raise InputError(
+            f"{Path(file).name}, line {line}: a face without texture coordinates among faces that have them",
+            file=scene,
+            field=name,
+            expected="texture coordinates (vt) at every corner of every face",
+        )
 
 
 def _grid(n_u: int, n_v: int) -> tuple[np.ndarray, np.ndarray]:
@@ -312,9 +380,6 @@ def _disk(props: JitArray) -> Tessellation:
 
 def _cylinder(props: JitArray) -> Tessellation:
     # u = azimuth / 2π, v along the axis: cylinder.cpp of Mitsuba 3.9.
-    from mitsuba import ScalarTransform4f as Transform
-    from mitsuba import coordinate_system as mitsuba_coordinate_system
-
     uv, faces = _grid(SEGMENTS, 1)
     phi = 2 * np.pi * uv[:, 0]
     normals = np.stack([np.cos(phi), np.sin(phi), np.zeros(len(uv))], -1)
@@ -323,9 +388,9 @@ def _cylinder(props: JitArray) -> Tessellation:
     radius = float(props["radius"]) if "radius" in props else 1.0
     axis = p1 - p0
     length = np.linalg.norm(axis)
-    s, t = (np.array(v, float) for v in mitsuba_coordinate_system((axis / length).tolist()))
-    local = np.array(Transform().translate(p0.tolist()).matrix, float)
-    local[:3, :3] = np.stack([radius * s, radius * t, axis], -1)
+    s = coordinate_system(axis / length)
+    local = np.eye(4)
+    local[:3] = np.stack([radius * s, radius * np.cross(axis / length, s), axis, p0], -1)
     return np.concatenate([normals[:, :2], uv[:, 1:]], -1), normals, uv, faces, local
 
 

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from btfref.scene.description import Camera
     from btfref.scene.quadrics import Quadric
 
-#: Vertices of the rectangle that holds a shape: ``shaders/hosts/quadric.vert``.
-VERTICES = 6
+#: Of the rectangle that holds a shape: ``shaders/hosts/quadric.vert``.
+TRIANGLES = 2
 
 #: What a picture that is added to what is nearest is drawn nearer, in values of the depth buffer: programs round the
 #: depths of fragments apart by some 1e-7.

@@ -21,7 +21,8 @@ from btfref.rendering.environment_light.lighting import lighting_of
 from btfref.rendering.gl import device, quadrics
 from btfref.rendering.gl.raster import (
     clip_planes,
-    light_uniforms,
+    light_passes,
+    light_table,
     material_uniforms,
     triangle_table,
     world_to_clip,
@@ -146,6 +147,8 @@ def realtime(
             "environment": scene.environment.name if scene.environment else None,
             "kept": number_kept(needed),
             "mirrored": mirrored_meshes(scene.meshes),
+            "notes": list(scene.notes),
+            **scene.facts,
             **renderer.environment_facts,
             **device.facts(renderer.ctx),
         }
@@ -190,6 +193,7 @@ class Renderer:
         self._owned: list[JitArray] = []
         self._shown: dict[Key, tuple[device.ShaderRepresentation, JitArray, JitArray, Prepared | None]] = {}
         self._meshes: list[tuple[MeshDescription, Key, JitArray]] = []
+        self._emitters: list[tuple[MeshDescription, JitArray]] = []
         size = (self.camera.width, self.camera.height)
         limit = self.ctx.info["GL_MAX_RENDERBUFFER_SIZE"]
         if max(size) > limit:
@@ -202,12 +206,13 @@ class Renderer:
         colour = self._own(self.ctx.texture(size, 4, dtype="f4"))
         self._target = self._own(self.ctx.framebuffer([colour], self._own(self.ctx.depth_renderbuffer(size))))
         self._near, self._far = clip_planes(self.camera, scene.meshes)
-        self._lights = light_uniforms(scene.lights) if scene.lights else {}
+        self._lights = self._own(device.upload(self.ctx, light_table(scene.lights), "scene_lights"))
         self._n_lights, self._lighting = len(scene.lights), lighting
         if lighting is None:
             self._lighting = lighting_of(scene)
         self._light_facts: Facts = {}
         self._hosts: dict[tuple[str, bool], tuple[JitArray, JitArray]] = {}
+        self._emitter: tuple[JitArray, JitArray] | None = None
         self._seen: tuple[JitArray, JitArray] | None = None
         self._counting = {"COUNT_FETCHES": 1} if count_fetches else {}
         try:
@@ -228,6 +233,11 @@ class Renderer:
         return thing
 
     def _add(self, number: int, mesh: MeshDescription, load_file: LoadFile) -> None:
+        if mesh.only_emits:
+            self._emitters.append(
+                (mesh, self._own(device.upload(self.ctx, triangle_table(mesh), "triangles")))
+            )
+            return
         material = mesh.btf
         own = number if self._lighting is not None and self._lighting.per_mesh else None
         # Matrices of transfer belong to triangles.
@@ -243,7 +253,9 @@ class Renderer:
                 self.ctx, rep, filter_type=material.filter_type, light=light
             )
             defines = {"N_LIGHTS": self._n_lights, **self._counting}
-            by_pixel = light is not None and len(light.passes) > 1 and light.bins is None
+            by_pixel = len(light_passes(light, self._n_lights, 1)) > 1 and (
+                light is None or light.bins is None
+            )
             if by_pixel:
                 defines["SEEN"] = 1
                 self._what_is_seen()
@@ -275,7 +287,8 @@ class Renderer:
 
     def _draw_all(self, fragment: str, common: dict[str, Any]) -> None:
         """Draw all surfaces by a host that knows no material."""
-        for number, (mesh, _, table) in enumerate(self._meshes):
+        shown = [(mesh, table) for mesh, _, table in self._meshes]
+        for number, (mesh, table) in enumerate(shown + self._emitters):
             exact = table is None
             if (fragment, exact) not in self._hosts:
                 vertex, defines = ("quadric", {"QUADRIC": 1}) if exact else ("mesh", {})
@@ -284,7 +297,8 @@ class Renderer:
             program, vertices = self._hosts[fragment, exact]
             device.bind(program, {} if exact else {"triangles": table})
             device.set_uniforms(program, {**common, **self._surface(mesh, table, common), "mesh": number})
-            vertices.render(self.ctx.TRIANGLES, vertices=quadrics.VERTICES if exact else 3 * len(mesh.faces))
+            count = quadrics.TRIANGLES if exact else len(mesh.faces)
+            vertices.render(self.ctx.TRIANGLES, vertices=3 * count)
 
     def _surface(
         self, mesh: MeshDescription, table: JitArray | None, common: dict[str, Any], *, adds: bool = False
@@ -325,44 +339,56 @@ class Renderer:
             # gl_FragCoord is at pixel centres.
             "film_offset": np.asarray(offset, float) - 0.5,
             "film_height": float(camera.height),
-            **self._lights,
         }
         ctx.finish()
         start = time.perf_counter()
         query = ctx.query(time=True)
         with query:
-            adds = any(light is not None and len(light.passes) > 1 for *_, light in self._shown.values())
+            adds = any(len(light_passes(light, self._n_lights, 1)) > 1 for *_, light in self._shown.values())
             if adds:
                 if self._seen is not None:
                     self._fill_seen(common)
                 self._fill_depth(common)
+            self._draw_emitters(common)
             for index, (mesh, key, table) in enumerate(self._meshes):
                 shown, program, vertices, light = self._shown[key]
                 tables, by_pixel = dict(shown.textures), "seen" in program
                 if table is not None:
                     tables["triangles"] = table
+                tables["scene_lights"] = self._lights
                 if by_pixel:
                     tables["seen"] = self._what_is_seen()[0]
                     ctx.depth_func, self._target.depth_mask = ">", False
                 device.bind(program, tables)
                 own = material_uniforms(mesh.btf, shown.texels, share * camera.pixel_angle)
-                own |= self._surface(mesh, table, common, adds=adds)
+                own |= self._surface(mesh, table, common, adds=adds) | {"emission": mesh.emission}
                 device.set_uniforms(program, {**common, **own, "mesh": index})
-                passes: Sequence[Facts] = ({},) if light is None else light.passes
-                whole = quadrics.VERTICES if table is None else 3 if by_pixel else 3 * len(mesh.faces)
-                counts = [whole] * len(passes)
                 if light is not None and light.bins is not None and light.transfer is not None:
-                    counts = (3 * np.diff(light.bins)).tolist()
                     device.set_uniforms(program, {"transfer_components": light.transfer.table.shape[3]})
-                for number, (values, count) in enumerate(zip(passes, counts, strict=True)):
+                whole = quadrics.TRIANGLES if table is None else 1 if by_pixel else len(mesh.faces)
+                passes = light_passes(light, self._n_lights, whole)
+                for number, (values, count) in enumerate(passes):
                     device.set_uniforms(program, {**values, "pass": number})
-                    vertices.render(ctx.TRIANGLES, vertices=count)
+                    vertices.render(ctx.TRIANGLES, vertices=3 * count)
                 if by_pixel:
                     ctx.depth_func, self._target.depth_mask = "<=", True
         ctx.depth_func = "<"
         ctx.disable(ctx.BLEND)
         ctx.finish()
         return max(1e-6 * query.elapsed, 1e3 * (time.perf_counter() - start))
+
+    def _draw_emitters(self, common: dict[str, Any]) -> None:
+        """Draw the lights that are seen and have no material."""
+        if not self._emitters:
+            return
+        if self._emitter is None:
+            program = self._own(device.compile_program(self.ctx, "hosts/mesh.vert", "hosts/emitter.frag"))
+            self._emitter = program, self._own(self.ctx.vertex_array(program, []))
+        program, vertices = self._emitter
+        for mesh, table in self._emitters:
+            device.bind(program, {"triangles": table})
+            device.set_uniforms(program, {**common, "emission": mesh.emission})
+            vertices.render(self.ctx.TRIANGLES, vertices=3 * len(mesh.faces))
 
     @property
     def transfers(self) -> list[TransferLight]:

@@ -20,6 +20,7 @@ from btfref.rendering.environment_light.lighting import lighting_of
 from btfref.representations.protocol import HasLevels
 from btfref.scene.description import read_scene
 from btfref.scene.hits import Hits, surfaces
+from btfref.scene.instances import drawn_shapes
 from btfref.scene.loading import loaded
 from btfref.types import SceneLike
 
@@ -84,9 +85,15 @@ def approximate(
     reps, prepared, total = {}, {}, np.zeros((camera.height * camera.width, 3))
     wanted = np.full(len(total), True) if pixels is None else np.ravel(pixels)
     with loaded(scene, parameters, size=size, sampled=False) as made:
+        shapes = drawn_shapes(made, [mesh.where for mesh in description.meshes])
         for surface in surfaces(made, grid):
-            for number, (mesh, shape) in enumerate(zip(description.meshes, made.shapes(), strict=True)):
-                hits = Hits.of(surface, mesh.btf, np.flatnonzero(surface.sees(shape) & wanted))
+            for number, (mesh, drawn) in enumerate(zip(description.meshes, shapes, strict=True)):
+                seen = surface.sees(drawn) & wanted
+                # Mitsuba's area light shines on the side of the shading normal.
+                total[seen & (surface["wi"][:, 2] > 0)] += mesh.emission
+                if mesh.only_emits:
+                    continue
+                hits = Hits.of(surface, mesh.btf, np.flatnonzero(seen))
                 if not len(hits.at):
                     continue
                 name = mesh.btf.filename
@@ -108,6 +115,7 @@ def approximate(
         "grid": grid,
         "shadows": False,
         "environment": description.environment.name if description.environment else None,
+        **description.facts,
         "seconds": time.perf_counter() - start,
     }
     if len(facts) == 1:
@@ -156,12 +164,7 @@ def _radiance(
 
     everywhere, total = np.arange(len(hits.at)), np.zeros((len(hits.at), 3))
     for light in description.lights:
-        towards, power = light.position - hits.position, light.power
-        if light.kind == "directional":
-            towards = np.broadcast_to(light.position, hits.position.shape)
-        else:
-            square = (towards**2).sum(1, keepdims=True)
-            towards, power = towards / np.sqrt(square), power / square
+        towards, power = light.incident(hits.position)
         w_light = np.einsum("ni,nij->nj", towards, hits.to_world)
         total += power * evaluate(hits.uv, w_light, hits.w_view, everywhere)
     if prepared is not None:

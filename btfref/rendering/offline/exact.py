@@ -20,7 +20,7 @@ from btfref.rendering import RenderResult
 from btfref.scene.camera import film_rays
 from btfref.scene.description import read_scene
 from btfref.scene.hits import Hits
-from btfref.scene.lights import distant_or_delta
+from btfref.scene.lights import checked_emitters
 from btfref.scene.loading import loaded
 from btfref.types import JitArray, SceneLike
 
@@ -272,7 +272,7 @@ def _intersect(
     si = scene.ray_intersect(ray)
     hits = Hits.at_interaction(material, si)
     lights = []
-    for emitter in distant_or_delta(scene):
+    for emitter in checked_emitters(scene):
         sample, power = emitter.sample_direction(si, chosen, si.is_valid())
         power = dr.select(si.is_valid() & (sample.pdf > 0), mi.Color3f(power), 0)
         lights.append((hits.local(si.to_local(sample.d)), power))

@@ -138,6 +138,8 @@ def traced(
 
     from btfref.provenance import versions
 
+    if not made.emitters():
+        raise InputError("the scene has no light", field="emitter")
     spp = spp or int(made.sensors()[0].sampler().sample_count())
     tell_camera(made, 1 / (grid or spp**0.5))
     start = time.perf_counter()
