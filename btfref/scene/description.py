@@ -14,6 +14,7 @@ from btfref.platform import prepare_llvm
 from btfref.scene import parsing
 from btfref.scene.area_lights import area_lights
 from btfref.scene.environment import SUN_APERTURE, Environment, from_emitter
+from btfref.scene.materials import PlainMaterials, bitmap_of
 from btfref.scene.instances import drawn_nodes, drawn_shapes
 from btfref.scene.lights import Light, is_area, light_of
 from btfref.scene.shapes import BtfMaterial, MeshDescription, triangles_of
@@ -110,18 +111,6 @@ class SceneDescription:
     facts: Facts = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
-    def demand_btfs(self, what: str) -> None:
-        """Refuse shapes without a BTF, in the name of ``what``.
-
-        Raises
-        ------
-        InputError
-        """
-        for mesh in self.meshes:
-            if mesh.material is None and not mesh.only_emits:
-                where = f"{self.source}: shape {mesh.name}"
-                raise InputError(f"{what} needs a btf material", file=where, field="bsdf", got=mesh.bsdf)
-
 
 def read_scene(
     scene: SceneLike,
@@ -165,15 +154,19 @@ def read_scene(
     notes = check(parsed, nodes, [one.node for one in drawn])
     apart = [(parsed.location(n), n.props.plugin_name(), _aperture(n)) for n in nodes["Emitter"]]
     materials = [parsing.material_of(parsed, one.node) for one in drawn]
-    parsing.plain(parsed)
+    bitmaps = [bitmap_of(parsed, one.node) for one in drawn]
+    parsing.plain(parsed, btf_alone=True)
     made = parsed.instantiate()
     if not isinstance(made, types.Scene) or len(made.shapes()) != len({one.where.number for one in drawn}):
         raise InputError("the file does not describe one scene of separate shapes", file=parsed.source)
     shapes = [one.shape for one in drawn_shapes(made, [one.where for one in drawn])]
-    meshes = []
-    for shape, one, (bsdf, material) in zip(shapes, drawn, materials, strict=True):
+    meshes, plain = [], PlainMaterials(types)
+    for shape, one, (bsdf, material), bitmap in zip(shapes, drawn, materials, bitmaps, strict=True):
         name, file = one.name(shape.id() or one.node.props.plugin_name()), parsed.location(one.node)
-        data = triangles_of(shape, one.node, file=file, name=name, outer=one.outer)
+        data = triangles_of(shape, one.node, file=file, name=name, outer=one.outer, btf=material is not None)
+        if material is None:
+            data["plain"] = plain.of(shape, bitmap, file=file, name=name)
+            notes += plain.note(data["plain"], name, bsdf)
         plugin = one.node.props.plugin_name()
         data["emission"] = _emission(shape, types)
         data |= {"name": name, "plugin": plugin, "bsdf": bsdf, "material": material, "where": one.where}

@@ -227,14 +227,17 @@ def _whole_film(film: JitArray) -> None:
             del props[name]
 
 
-def plain(parsed: ParsedScene) -> None:
-    """Replace what the geometry does not need, so that no material, texture or integrator is loaded."""
+def plain(parsed: ParsedScene, *, btf_alone: bool = False) -> None:
+    """Replace what the geometry does not need, so that no material, texture or integrator is loaded.
+
+    With ``btf_alone`` other materials than BTFs stay.
+    """
     import mitsuba as mi
 
     for node in parsed.nodes:
         kinds = {"BSDF": "diffuse", "Integrator": "direct"}
         kind = next((k for k in kinds if is_kind(node, k)), None)
-        if kind:
+        if kind and not (btf_alone and kind == "BSDF" and node.props.plugin_name() != BTF):
             for key in list(node.props.keys()):
                 del node.props[key]
             node.props.set_plugin_name(kinds[kind])

@@ -11,6 +11,7 @@ from btfref.scene.camera import film_rays, grid_offsets
 from btfref.scene.instances import every_shape
 from btfref.scene.lights import is_delta
 from btfref.scene.loading import loaded
+from btfref.scene.materials import is_exact
 from btfref.types import JitArray, SceneLike
 
 #: A step between neighbouring samples that leaves the tangent plane by more than this share of a pixel's
@@ -74,7 +75,8 @@ def pixel_classes(
     its samples or those of its eight neighbours meet an edge: they mix hit and miss or several shapes, the surface
     jumps in depth between two of them (a fold in front of the cloth itself), or turns away from the view.
     *Mesostructure* are other pixels in which a material with a geometry of its own (a g-BRDF) jumps within `HIT` of a
-    sample, under one of the scene's delta lights. All other pixels that are hit are *interior*.
+    sample, under one of the scene's delta lights. All other pixels that are hit are *interior*. *Other* is every pixel
+    with a sample that sees a material of which real time shows the mean albedo (:mod:`btfref.scene.materials`).
 
     Parameters
     ----------
@@ -100,6 +102,7 @@ def pixel_classes(
             made, grid, ROUNDING if follows_rays else np.inf
         )
         jumps = _displaced_edges(made, grid)
+        other = _other_materials(made, grid)
     hit = shape > 0
     edge = np.zeros(shape.shape, bool)
     for axis in (0, 1):
@@ -117,7 +120,32 @@ def pixel_classes(
     seen = np.where(any_hit, np.where(any_edge, PixelClass.EDGE, PixelClass.INTERIOR), PixelClass.BACKGROUND)
     seen = np.where(jumps & any_hit, PixelClass.MESOSTRUCTURE, seen)
     seen = np.where(np.any(ambiguous.reshape(pixels), axis=(1, 3)), PixelClass.SILHOUETTE, seen)
-    return seen.astype(np.uint8)
+    return np.where(other, PixelClass.OTHER, seen).astype(np.uint8)
+
+
+def _other_materials(scene: JitArray, grid: int) -> np.ndarray | bool:
+    """Pixels with a sample that sees a material that real time shows otherwise, bool (H, W), or False without any."""
+    import drjit as dr
+    import mitsuba as mi
+
+    others = [bsdf for bsdf in {id(b): b for b in _materials(scene)}.values() if not is_exact(bsdf)]
+    if not others:
+        return False
+    sensor = scene.sensors()[0]
+    width, height = (int(k) for k in sensor.film().crop_size())
+    found = np.zeros(width * height, bool)
+    for offset in grid_offsets(grid):
+        si = scene.ray_intersect(film_rays(sensor, offset)[0])
+        seen = dr.reinterpret_array(mi.UInt32, si.bsdf())
+        dr.eval(seen)
+        numbers = [int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]) for bsdf in others]
+        found |= np.array(si.is_valid()) & np.isin(np.array(seen), numbers)
+    return found.reshape(height, width)
+
+
+def _materials(scene: JitArray) -> list[JitArray]:
+    """Materials of all shapes."""
+    return [shape.bsdf() for shape in every_shape(scene)]
 
 
 def _displaced_edges(scene: JitArray, grid: int) -> np.ndarray | bool:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.sphere.frames import Turn, nearest_turn
 from btfref.scene.instances import Where
+from btfref.scene.materials import PlainMaterial
 from btfref.scene.quadrics import KINDS, Quadric
 from btfref.types import JitArray, PathLike
 
@@ -55,6 +56,9 @@ class BtfMaterial:
     lod_bias: float = 0.0
     lod_unit: float = 1.0
 
+    #: Real time shows it as it is.
+    exact: ClassVar[bool] = True
+
     @property
     def turn(self) -> Turn:
         """What takes local directions to the frame of the transformed texture."""
@@ -91,6 +95,8 @@ class MeshDescription:
         Radiance of its own light on the side of its shading normal, in W/(m² sr).
     quadric : btfref.scene.quadrics.Quadric or None
         Of a sphere, disk or cylinder, whose triangles are an approximation.
+    plain : btfref.scene.materials.PlainMaterial or None
+        What is shown of a material that is no BTF.
     """
 
     name: str
@@ -106,11 +112,18 @@ class MeshDescription:
     where: Where = Where(0)
     emission: np.ndarray = field(default_factory=lambda: np.zeros(3))
     quadric: Quadric | None = None
+    plain: PlainMaterial | None = None
 
     @property
-    def only_emits(self) -> bool:
-        """Whether it is a light without a material: Mitsuba then makes it black."""
-        return self.material is None and self.bsdf == "none" and bool(np.any(self.emission > 0))
+    def shown(self) -> BtfMaterial | PlainMaterial:
+        """What is shown: the BTF, or what stands for another material.
+
+        Raises
+        ------
+        InputError
+            When it has neither.
+        """
+        return self.plain if self.material is None and self.plain is not None else self.btf
 
     @property
     def btf(self) -> BtfMaterial:
@@ -124,6 +137,12 @@ class MeshDescription:
         if self.material is None:
             raise InputError("a btf material is needed", field=self.name, got=self.bsdf)
         return self.material
+
+    @property
+    def twosided(self) -> bool:
+        """Whether its back is seen as its front is."""
+        material = self.material or self.plain
+        return material is not None and material.twosided
 
     def corners(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Per-triangle data for shading as Mitsuba 3.9 does it.
@@ -212,7 +231,7 @@ def _unit(v: np.ndarray) -> np.ndarray:
 
 
 def triangles_of(
-    shape: JitArray, node: JitArray, *, file: PathLike, name: str, outer: np.ndarray
+    shape: JitArray, node: JitArray, *, file: PathLike, name: str, outer: np.ndarray, btf: bool = True
 ) -> dict[str, Any]:
     """Vertices of a shape, read from the instantiated mesh or tessellated.
 
@@ -227,6 +246,8 @@ def triangles_of(
         Of the shape, likewise.
     outer : ndarray, shape (4, 4)
         Transform of the instance that shows the shape.
+    btf : bool
+        Whether it shows a BTF, which needs texture coordinates of its own.
 
     Returns
     -------
@@ -236,7 +257,7 @@ def triangles_of(
     Raises
     ------
     InputError
-        For a shape without texture coordinates or of a kind that has no triangles here.
+        For a shape with a BTF and without texture coordinates, or of a kind that has no triangles here.
     """
     import mitsuba as mi
 
@@ -245,9 +266,9 @@ def triangles_of(
     to_world = outer @ (np.array(props["to_world"].matrix, float) if "to_world" in props else np.eye(4))
     common = {"to_world": to_world}
     if shape.is_mesh() and plugin not in _TESSELLATIONS:
-        if not shape.has_vertex_texcoords():
+        if not shape.has_vertex_texcoords() and btf:
             raise InputError("the shape has no texture coordinates", file=file, field=name, got=plugin)
-        if plugin == "obj":
+        if plugin == "obj" and btf:
             refuse_partial_uv(props["filename"], scene=file, name=name)
         arrays = mi.traverse(shape)
         normals, flip = None, bool(shape.has_flipped_normals())
@@ -261,13 +282,16 @@ def triangles_of(
                 flip ^= bool(np.linalg.det(outer[:3, :3]) < 0)
             else:
                 normals = _unit(normals @ np.linalg.inv(outer[:3, :3]))
-        return common | {
-            "positions": positions,
-            "normals": normals,
-            "uv": np.array(arrays["vertex_texcoords"]).reshape(-1, 2),
-            "faces": np.array(arrays["faces"]).reshape(-1, 3).astype(np.int64),
-            "flip": flip,
-        }
+        faces = np.array(arrays["faces"]).reshape(-1, 3).astype(np.int64)
+        if shape.has_vertex_texcoords():
+            uv = np.array(arrays["vertex_texcoords"]).reshape(-1, 2)
+        else:
+            # Mitsuba's own: barycentric coordinates, in each triangle anew.
+            uv = np.tile([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], (len(faces), 1))
+            positions = positions[faces].reshape(-1, 3)
+            normals = None if normals is None else normals[faces].reshape(-1, 3)
+            faces = np.arange(len(uv)).reshape(-1, 3)
+        return common | {"positions": positions, "normals": normals, "uv": uv, "faces": faces, "flip": flip}
     if plugin not in _TESSELLATIONS:
         known = ", ".join(["meshes", *_TESSELLATIONS])
         raise InputError(

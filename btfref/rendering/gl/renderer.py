@@ -9,7 +9,7 @@ samples a pixel, box filter. Each sample is one frame with a shifted projection;
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,6 +29,7 @@ from btfref.rendering.gl.raster import (
 )
 from btfref.scene.demand import MARGIN, kept_maps, number_kept
 from btfref.scene.description import SceneDescription, read_scene
+from btfref.scene.materials import PlainMaterial
 from btfref.scene.mirrored import mirrored_meshes
 from btfref.types import Facts, JitArray, SceneLike
 
@@ -46,8 +47,8 @@ if TYPE_CHECKING:
 #: Gives the representation of a file.
 LoadFile = Callable[[str], "Representation"]
 
-#: Of what is shown: file, texel filter, the mesh where each has light of its own, and whether it is on a quadric.
-Key = tuple[str, str | None, int | None, bool]
+#: Of what is shown: file or material, texel filter, the mesh where each has light of its own, and whether it is on a quadric.
+Key = tuple["str | PlainMaterial", str | None, int | None, bool]
 
 
 def realtime(
@@ -95,7 +96,8 @@ def realtime(
     -------
     RenderResult
         A sample's footprint, and so the level of detail of methods that have levels, is that of 1/n of a pixel.
-        ``meta["mirrored"]`` names the shapes whose texture is mirrored; ``meta["frame_ms"]`` is the median time of one
+        ``meta["mirrored"]`` names the shapes whose texture is mirrored; ``other_materials`` those whose material is drawn
+        as its mean albedo, with its plugin (:mod:`btfref.scene.materials`); ``meta["frame_ms"]`` is the median time of one
         frame (one sample a pixel), GPU timer and wall clock whichever is longer; ``gl_vendor``, ``gl_renderer``,
         ``gl_version``; ``negative_fraction``, the share of channels below zero, and ``not_finite``, their number:
         nothing is clamped; ``kept``, how many maps were kept by file. With an environment ``environment_path``, the way
@@ -105,8 +107,8 @@ def realtime(
     Raises
     ------
     InputError
-        For a scene that cannot be read (see :func:`btfref.scene.description.read_scene`), without lights, with a shape
-        that has no BTF, or with a way to light by the environment that a method lacks.
+        For a scene that cannot be read (see :func:`btfref.scene.description.read_scene`), without lights, or with a way
+        to light by the environment that a method lacks.
     MissingDependencyError
         Without an OpenGL driver.
     """
@@ -148,6 +150,7 @@ def realtime(
             "kept": number_kept(needed),
             "mirrored": mirrored_meshes(scene.meshes),
             "notes": list(scene.notes),
+            "other_materials": {mesh.name: mesh.bsdf for mesh in scene.meshes if not mesh.shown.exact},
             **scene.facts,
             **renderer.environment_facts,
             **device.facts(renderer.ctx),
@@ -187,13 +190,11 @@ class Renderer:
     ) -> None:
         if not scene.lights and scene.environment is None:
             raise InputError("the scene has no light", file=scene.source, field="emitter")
-        scene.demand_btfs("real-time rendering")
         self.ctx = device.context()
         self.camera = scene.camera
         self._owned: list[JitArray] = []
         self._shown: dict[Key, tuple[device.ShaderRepresentation, JitArray, JitArray, Prepared | None]] = {}
         self._meshes: list[tuple[MeshDescription, Key, JitArray]] = []
-        self._emitters: list[tuple[MeshDescription, JitArray]] = []
         size = (self.camera.width, self.camera.height)
         limit = self.ctx.info["GL_MAX_RENDERBUFFER_SIZE"]
         if max(size) > limit:
@@ -211,8 +212,8 @@ class Renderer:
         if lighting is None:
             self._lighting = lighting_of(scene)
         self._light_facts: Facts = {}
+        self._programs: dict[Hashable, tuple[JitArray, JitArray]] = {}
         self._hosts: dict[tuple[str, bool], tuple[JitArray, JitArray]] = {}
-        self._emitter: tuple[JitArray, JitArray] | None = None
         self._seen: tuple[JitArray, JitArray] | None = None
         self._counting = {"COUNT_FETCHES": 1} if count_fetches else {}
         try:
@@ -233,22 +234,22 @@ class Renderer:
         return thing
 
     def _add(self, number: int, mesh: MeshDescription, load_file: LoadFile) -> None:
-        if mesh.only_emits:
-            self._emitters.append(
-                (mesh, self._own(device.upload(self.ctx, triangle_table(mesh), "triangles")))
-            )
-            return
-        material = mesh.btf
-        own = number if self._lighting is not None and self._lighting.per_mesh else None
+        material, lighting = mesh.shown, self._lighting
+        if lighting is not None and isinstance(material, PlainMaterial):
+            lighting = lighting.of_plain
+        own = number if lighting is not None and lighting.per_mesh else None
         # Matrices of transfer belong to triangles.
         exact = mesh.quadric is not None and own is None
-        key = (material.filename, material.filter_type, own, exact)
+        what = material if isinstance(material, PlainMaterial) else material.filename
+        key = (what, material.filter_type, own, exact)
         if key not in self._shown:
-            rep = load_file(material.filename)
+            rep = what if isinstance(what, PlainMaterial) else load_file(what)
             light = None
-            if self._lighting is not None:
-                light = self._lighting.prepared(rep, file=material.filename, mesh=own)
-                self._light_facts[material.filename] = {"environment_path": light.path, **light.facts}
+            if lighting is not None:
+                file = what if isinstance(what, str) else None
+                light = lighting.prepared(rep, file=file, mesh=own)
+                if file:
+                    self._light_facts[file] = {"environment_path": light.path, **light.facts}
             shown = device.ShaderRepresentation.upload(
                 self.ctx, rep, filter_type=material.filter_type, light=light
             )
@@ -262,11 +263,21 @@ class Renderer:
             if exact:
                 defines["QUADRIC"] = 1
             vertex = "quadric" if exact else "screen" if by_pixel else "mesh"
-            program = shown.program(self.ctx, f"hosts/{vertex}.vert", "hosts/mesh.frag", defines=defines)
-            self._own(program), self._own(shown)
-            self._shown[key] = shown, program, self._own(self.ctx.vertex_array(program, [])), light
+            program, vertices = self._program(shown, f"hosts/{vertex}.vert", defines)
+            self._shown[key] = self._own(shown), program, vertices, light
         table = None if exact else self._own(device.upload(self.ctx, triangle_table(mesh), "triangles"))
         self._meshes.append((mesh, key, table))
+
+    def _program(
+        self, shown: device.ShaderRepresentation, vertex: str, defines: dict[str, Any]
+    ) -> tuple[JitArray, JitArray]:
+        """A program, and what it is drawn with; many materials are of one kind, and differ in what they read."""
+        constants = tuple(sorted({**shown.defines, **defines}.items()))
+        key = vertex, shown.shader, shown.environment, constants
+        if key not in self._programs:
+            made = self._own(shown.program(self.ctx, vertex, "hosts/mesh.frag", defines=defines))
+            self._programs[key] = made, self._own(self.ctx.vertex_array(made, []))
+        return self._programs[key]
 
     def _what_is_seen(self) -> tuple[JitArray, JitArray]:
         """What each pixel sees: passes that add up shade pixels, not triangles of less than a pixel anew each time."""
@@ -287,8 +298,7 @@ class Renderer:
 
     def _draw_all(self, fragment: str, common: dict[str, Any]) -> None:
         """Draw all surfaces by a host that knows no material."""
-        shown = [(mesh, table) for mesh, _, table in self._meshes]
-        for number, (mesh, table) in enumerate(shown + self._emitters):
+        for number, (mesh, _, table) in enumerate(self._meshes):
             exact = table is None
             if (fragment, exact) not in self._hosts:
                 vertex, defines = ("quadric", {"QUADRIC": 1}) if exact else ("mesh", {})
@@ -349,7 +359,6 @@ class Renderer:
                 if self._seen is not None:
                     self._fill_seen(common)
                 self._fill_depth(common)
-            self._draw_emitters(common)
             for index, (mesh, key, table) in enumerate(self._meshes):
                 shown, program, vertices, light = self._shown[key]
                 tables, by_pixel = dict(shown.textures), "seen" in program
@@ -360,7 +369,7 @@ class Renderer:
                     tables["seen"] = self._what_is_seen()[0]
                     ctx.depth_func, self._target.depth_mask = ">", False
                 device.bind(program, tables)
-                own = material_uniforms(mesh.btf, shown.texels, share * camera.pixel_angle)
+                own = material_uniforms(mesh.shown, shown.texels, share * camera.pixel_angle)
                 own |= self._surface(mesh, table, common, adds=adds) | {"emission": mesh.emission}
                 device.set_uniforms(program, {**common, **own, "mesh": index})
                 if light is not None and light.bins is not None and light.transfer is not None:
@@ -376,19 +385,6 @@ class Renderer:
         ctx.disable(ctx.BLEND)
         ctx.finish()
         return max(1e-6 * query.elapsed, 1e3 * (time.perf_counter() - start))
-
-    def _draw_emitters(self, common: dict[str, Any]) -> None:
-        """Draw the lights that are seen and have no material."""
-        if not self._emitters:
-            return
-        if self._emitter is None:
-            program = self._own(device.compile_program(self.ctx, "hosts/mesh.vert", "hosts/emitter.frag"))
-            self._emitter = program, self._own(self.ctx.vertex_array(program, []))
-        program, vertices = self._emitter
-        for mesh, table in self._emitters:
-            device.bind(program, {"triangles": table})
-            device.set_uniforms(program, {**common, "emission": mesh.emission})
-            vertices.render(self.ctx.TRIANGLES, vertices=3 * len(mesh.faces))
 
     @property
     def transfers(self) -> list[TransferLight]:

@@ -79,7 +79,6 @@ def approximate(
     description = read_scene(scene, parameters, size=size)
     if not description.lights and description.environment is None:
         raise InputError("the scene has no light", file=description.source, field="emitter")
-    description.demand_btfs("the approximation")
     lighting = lighting_of(description, path, **options)
     start, camera = time.perf_counter(), description.camera
     reps, prepared, total = {}, {}, np.zeros((camera.height * camera.width, 3))
@@ -91,10 +90,14 @@ def approximate(
                 seen = surface.sees(drawn) & wanted
                 # Mitsuba's area light shines on the side of the shading normal.
                 total[seen & (surface["wi"][:, 2] > 0)] += mesh.emission
-                if mesh.only_emits:
-                    continue
-                hits = Hits.of(surface, mesh.btf, np.flatnonzero(seen))
+                hits = Hits.of(surface, mesh.shown, np.flatnonzero(seen))
                 if not len(hits.at):
+                    continue
+                if mesh.material is None:
+                    rep, light = mesh.plain, None
+                    if lighting is not None:
+                        light = lighting.of_plain.prepared(rep)
+                    total[hits.at] += _radiance(rep, hits, mesh, description, grid, light)
                     continue
                 name = mesh.btf.filename
                 if name not in reps:
