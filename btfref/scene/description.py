@@ -12,12 +12,12 @@ import numpy as np
 from btfref.errors import InputError, MissingDependencyError
 from btfref.platform import prepare_llvm
 from btfref.scene import parsing
-from btfref.scene.area_lights import area_lights
+from btfref.scene.emitters.area_lights import area_lights
+from btfref.scene.emitters.lights import Light, is_area, light_of
 from btfref.scene.environment import SUN_APERTURE, Environment, from_emitter
-from btfref.scene.instances import drawn_nodes, drawn_shapes
-from btfref.scene.lights import Light, is_area, light_of
+from btfref.scene.reading.instances import drawn_nodes, drawn_shapes
+from btfref.scene.reading.supported import check
 from btfref.scene.shapes import BtfMaterial, MeshDescription, triangles_of
-from btfref.scene.supported import check
 from btfref.types import Facts, JitArray, SceneLike
 
 __all__ = ["BtfMaterial", "Camera", "Light", "MeshDescription", "SceneDescription", "read_scene"]
@@ -160,11 +160,9 @@ def read_scene(
     types = parsing.scalar_types()
     parsed = parsing.parse(scene, parameters, variant=VARIANT, size=size, missing_btf=missing_btf)
     roots = parsed.children(parsed.state.root)
-    nodes = {
-        kind: [n for _, n in roots if parsing.is_kind(n, kind)] for kind in ("Sensor", "Emitter")
-    }
+    nodes = {kind: [n for _, n in roots if parsing.is_kind(n, kind)] for kind in ("Sensor", "Emitter")}
     drawn = drawn_nodes(parsed, [(i, n) for i, n in roots if parsing.is_kind(n, "Shape")])
-    notes = check(parsed, nodes, [one.node for one in drawn])
+    check(parsed, nodes, [one.node for one in drawn])
     apart = [(parsed.location(n), n.props.plugin_name(), _aperture(n)) for n in nodes["Emitter"]]
     materials = [parsing.material_of(parsed, one.node) for one in drawn]
     parsing.plain(parsed)
@@ -191,7 +189,7 @@ def read_scene(
     lights += areas.lights()
     camera = _camera(made.sensors()[0])
     return SceneDescription(
-        camera, tuple(meshes), tuple(lights), parsed.source, environment, areas.facts, tuple(notes)
+        camera, tuple(meshes), tuple(lights), parsed.source, environment, areas.facts, tuple(parsed.notes)
     )
 
 

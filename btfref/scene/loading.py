@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from btfref.errors import InputError
 from btfref.sampling.variant import no_collection
 from btfref.scene import parsing
-from btfref.scene.instances import every_shape
+from btfref.scene.reading.instances import every_shape
 from btfref.scene.shapes import refuse_partial_uv
 from btfref.types import JitArray, SceneLike
 
@@ -74,7 +74,9 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
                 parsing.plain(parsed)
             if sampled is None:
                 lights = [node for node in parsed.nodes if parsing.is_kind(node, "Emitter")]
-                sampled = any(node.props.plugin_name() not in (*parsing.DELTA_LIGHTS, "area") for node in lights)
+                sampled = any(
+                    node.props.plugin_name() not in (*parsing.DELTA_LIGHTS, "area") for node in lights
+                )
             for node in parsed.nodes:
                 if node.props.plugin_name() != parsing.BTF:
                     continue

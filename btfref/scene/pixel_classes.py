@@ -8,9 +8,9 @@ import numpy as np
 
 from btfref.conventions import PixelClass
 from btfref.scene.camera import film_rays, grid_offsets
-from btfref.scene.instances import every_shape
-from btfref.scene.lights import is_delta
+from btfref.scene.emitters.lights import is_delta
 from btfref.scene.loading import loaded
+from btfref.scene.reading.instances import every_shape
 from btfref.types import JitArray, SceneLike
 
 #: A step between neighbouring samples that leaves the tangent plane by more than this share of a pixel's

@@ -11,7 +11,7 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.sphere.frames import Turn, nearest_turn
-from btfref.scene.instances import Where
+from btfref.scene.reading.instances import Where
 from btfref.types import JitArray, PathLike
 
 #: Segments of a full turn of a tessellated sphere, disk or cylinder: chords lie within 4e-5 radii of the
@@ -84,7 +84,7 @@ class MeshDescription:
         Plugin of the BSDF, for messages.
     to_world : ndarray, shape (4, 4)
         The shape's own transform, as written in the scene, and its instance's (the positions have it already).
-    where : btfref.scene.instances.Where
+    where : btfref.scene.reading.instances.Where
         Which of Mitsuba's shapes it is.
     emission : ndarray, shape (3,)
         Radiance of its own light on the side of its shading normal, in W/(m² sr).
@@ -100,7 +100,7 @@ class MeshDescription:
     material: BtfMaterial | None
     bsdf: str
     to_world: np.ndarray
-    where: Where = Where(0)
+    where: Where = field(default_factory=lambda: Where(0))
     emission: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     @property

@@ -137,6 +137,8 @@ class Lighting:
         """Mean colour of a material under radiance 1, over texels and views, shape (3,)."""
         from btfref import representations
 
+        if mesh.only_emits:
+            return np.zeros(3)
         rep = representations.load(mesh.btf.filename)
         rng = np.random.default_rng(0)
         uv, w_view = rng.random((ALBEDO_SAMPLES, 2)), rng.normal(size=(ALBEDO_SAMPLES, 3))

@@ -10,7 +10,7 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.rendering.environment_light.lighting import PASS
-from btfref.scene.lights import KINDS
+from btfref.scene.emitters.lights import KINDS
 from btfref.scene.shapes import neighbours
 
 if TYPE_CHECKING:

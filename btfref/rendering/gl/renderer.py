@@ -9,7 +9,7 @@ samples a pixel, box filter. Each sample is one frame with a shifted projection;
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -234,7 +234,9 @@ class Renderer:
 
     def _add(self, number: int, mesh: MeshDescription, load_file: LoadFile) -> None:
         if mesh.only_emits:
-            self._emitters.append((mesh, self._own(device.upload(self.ctx, triangle_table(mesh), "triangles"))))
+            self._emitters.append(
+                (mesh, self._own(device.upload(self.ctx, triangle_table(mesh), "triangles")))
+            )
             return
         material = mesh.btf
         own = number if self._lighting is not None and self._lighting.per_mesh else None
@@ -249,7 +251,9 @@ class Renderer:
                 self.ctx, rep, filter_type=material.filter_type, light=light
             )
             defines = {"N_LIGHTS": self._n_lights, **self._counting}
-            by_pixel = len(light_passes(light, self._n_lights, 1)) > 1 and (light is None or light.bins is None)
+            by_pixel = len(light_passes(light, self._n_lights, 1)) > 1 and (
+                light is None or light.bins is None
+            )
             if by_pixel:
                 defines["SEEN"] = 1
                 self._what_is_seen()

@@ -162,9 +162,7 @@ def drawn_shapes(scene: JitArray, places: Iterable[Where]) -> list[Drawn]:
     """
     shapes, groups = scene.shapes(), _groups(scene)
     return [
-        Drawn(shapes[w.number])
-        if w.group is None
-        else Drawn(groups[w.group][w.member], shapes[w.number])
+        Drawn(shapes[w.number]) if w.group is None else Drawn(groups[w.group][w.member], shapes[w.number])
         for w in places
     ]
 
