@@ -128,6 +128,10 @@ def points_of(shape: JitArray, n: int, types: ModuleType) -> tuple[np.ndarray, n
 
     rows = [_array(values, n) for values in _each(sampled, types, x, y)]
     position, normal, radiance = rows[:3]
+    if shape.class_name() == "Sphere":
+        # Mitsuba 3.9 leaves the rotation of a sphere out of these normals.
+        normal = position - np.array(shape.bbox().center(), float).reshape(3)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True) * (-1 if shape.has_flipped_normals() else 1)
     return position, normal, radiance / (n * rows[3][:, :1])
 
 
