@@ -165,8 +165,8 @@ def demand(
     """
     from btfref.scene.description import read_scene
     from btfref.scene.hits import surfaces
-    from btfref.scene.instances import drawn_shapes
     from btfref.scene.loading import loaded
+    from btfref.scene.reading.instances import drawn_shapes
 
     if description is None:
         description = read_scene(scene, parameters, size=size, missing_btf=shape is not None)
@@ -175,7 +175,9 @@ def demand(
     for mesh in description.meshes:
         if mesh.material is not None and mesh.material.filename not in wanted:
             wanted[mesh.material.filename] = Touched(mesh.material.filename, shape, least)
-    from_everywhere = description.environment is not None
+    # Of area lights too: which directions they have is not followed.
+    areas = any(light.kind == "area" for light in description.lights)
+    from_everywhere = description.environment is not None or areas
     with loaded(scene, parameters, size=size, plain=True) as made:
         # Samples of the next pixel are ``grid`` samples away.
         beside = None

@@ -12,13 +12,13 @@ import numpy as np
 from btfref.errors import InputError, MissingDependencyError
 from btfref.platform import prepare_llvm
 from btfref.scene import parsing
-from btfref.scene.area_lights import area_lights
+from btfref.scene.emitters.area_lights import area_lights
+from btfref.scene.emitters.lights import Light, is_area, light_of
 from btfref.scene.environment import SUN_APERTURE, Environment, from_emitter
-from btfref.scene.materials import PlainMaterials, bitmap_of
-from btfref.scene.instances import drawn_nodes, drawn_shapes
-from btfref.scene.lights import Light, is_area, light_of
+from btfref.scene.reading.instances import drawn_nodes, drawn_shapes
+from btfref.scene.reading.supported import check
 from btfref.scene.shapes import BtfMaterial, MeshDescription, triangles_of
-from btfref.scene.supported import check
+from btfref.scene.surfaces.materials import PlainMaterials, bitmap_of
 from btfref.types import Facts, JitArray, SceneLike
 
 __all__ = ["BtfMaterial", "Camera", "Light", "MeshDescription", "SceneDescription", "read_scene"]
@@ -151,7 +151,7 @@ def read_scene(
     roots = parsed.children(parsed.state.root)
     nodes = {kind: [n for _, n in roots if parsing.is_kind(n, kind)] for kind in ("Sensor", "Emitter")}
     drawn = drawn_nodes(parsed, [(i, n) for i, n in roots if parsing.is_kind(n, "Shape")])
-    notes = check(parsed, nodes, [one.node for one in drawn])
+    check(parsed, nodes, [one.node for one in drawn])
     apart = [(parsed.location(n), n.props.plugin_name(), _aperture(n)) for n in nodes["Emitter"]]
     materials = [parsing.material_of(parsed, one.node) for one in drawn]
     bitmaps = [bitmap_of(parsed, one.node) for one in drawn]
@@ -163,10 +163,11 @@ def read_scene(
     meshes, plain = [], PlainMaterials(types)
     for shape, one, (bsdf, material), bitmap in zip(shapes, drawn, materials, bitmaps, strict=True):
         name, file = one.name(shape.id() or one.node.props.plugin_name()), parsed.location(one.node)
-        data = triangles_of(shape, one.node, file=file, name=name, outer=one.outer, btf=material is not None)
+        looked_up = {"btf": material is not None, "bitmap": bitmap is not None}
+        data = triangles_of(shape, one.node, file=file, name=name, outer=one.outer, **looked_up)
         if material is None:
             data["plain"] = plain.of(shape, bitmap, file=file, name=name)
-            notes += plain.note(data["plain"], name, bsdf)
+            parsed.notes += plain.note(data["plain"], name, bsdf)
         plugin = one.node.props.plugin_name()
         data["emission"] = _emission(shape, types)
         data |= {"name": name, "plugin": plugin, "bsdf": bsdf, "material": material, "where": one.where}
@@ -182,7 +183,7 @@ def read_scene(
     lights += areas.lights()
     camera = _camera(made.sensors()[0])
     return SceneDescription(
-        camera, tuple(meshes), tuple(lights), parsed.source, environment, areas.facts, tuple(notes)
+        camera, tuple(meshes), tuple(lights), parsed.source, environment, areas.facts, tuple(parsed.notes)
     )
 
 

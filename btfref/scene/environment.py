@@ -275,7 +275,7 @@ def _sky_picture(emitter: JitArray, types: ModuleType, values: JitArray, apertur
         return np.stack([np.sin(v) * np.sin(u), np.cos(v), -np.sin(v) * np.cos(u)], -1)
 
     def seen(d: np.ndarray) -> np.ndarray:
-        si, found = types.SurfaceInteraction3f(), np.empty(d.shape)
+        si, found = types.SurfaceInteraction3f(), np.zeros(d.shape)
         for k, w in enumerate((-d @ frame.T).tolist()):
             si.wi = w
             found[k] = emitter.eval(si, True)

@@ -9,7 +9,7 @@ import numpy as np
 from btfref.conventions import texel_stencil
 from btfref.numerics.sphere import interpolation
 from btfref.scene.hits import Hits
-from btfref.types import JitArray, PathLike
+from btfref.types import PathLike
 
 if TYPE_CHECKING:
     from btfref.numerics.sphere.directions import DirectionSet
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from btfref.representations.protocol import SeesTexels
     from btfref.scene.description import Camera
     from btfref.scene.hits import Surface
-    from btfref.scene.instances import Drawn
+    from btfref.scene.reading.instances import Drawn
     from btfref.scene.shapes import BtfMaterial
 
 
@@ -87,7 +87,7 @@ class Touched:
         Parameters
         ----------
         surface : Surface
-        drawn : btfref.scene.instances.Drawn
+        drawn : btfref.scene.reading.instances.Drawn
         material : BtfMaterial
             The shape's.
         camera : Camera

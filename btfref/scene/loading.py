@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from btfref.errors import InputError
 from btfref.sampling.variant import no_collection
 from btfref.scene import parsing
-from btfref.scene.instances import every_shape
+from btfref.scene.reading.instances import every_shape
 from btfref.scene.shapes import refuse_partial_uv
 from btfref.types import JitArray, SceneLike
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from btfref.scene.camera import film_rays
-from btfref.scene.instances import every_shape
+from btfref.scene.reading.instances import every_shape
 from btfref.types import JitArray
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def seen_mirrored(scene: JitArray) -> list[str]:
     dr.eval(shape_seen, hand)
     seen = set(zip(np.array(shape_seen).tolist(), np.array(hand).tolist(), strict=True))
     return [
-        shape.id()
+        shape.id() or shape.class_name().lower()
         for shape, hands in turns
         if any((int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]), -h) in seen for h in hands)
     ]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 
@@ -19,8 +19,8 @@ from btfref.numerics.footprint import MODES
 from btfref.numerics.sphere.frames import uv_transform
 from btfref.platform import set_variant
 from btfref.representations.file.container import refuse_store
-from btfref.scene.instances import without_merges
 from btfref.scene.parameters import check_parameters, search_paths
+from btfref.scene.reading.instances import without_merges
 from btfref.scene.shapes import BtfMaterial
 from btfref.scene.shipped import ENVIRONMENTS, scene_file
 from btfref.types import JitArray, SceneLike
@@ -49,11 +49,14 @@ class ParsedScene:
     config : mitsuba.parser.ParserConfig
     source : str
         The scene file, or "scene dictionary".
+    notes : list of str
+        What is drawn otherwise than its name says, a line each.
     """
 
     state: JitArray
     config: JitArray
     source: str
+    notes: list[str] = field(default_factory=list)
 
     @property
     def nodes(self) -> JitArray:
@@ -208,6 +211,8 @@ def parse(
         _resolve_file(parsed, node, beside, missing_btf)
         if _is(node, "Film"):
             _whole_film(node)
+        if node.props.plugin_name() == "thinlens":
+            _pinhole(parsed, node)
         if _is(node, "Film") and size is not None:
             node.props["width"], node.props["height"] = int(size[0]), int(size[1])
         if _is(node, "Film") and all(name in node.props for name in ("width", "height")):
@@ -225,6 +230,16 @@ def _whole_film(film: JitArray) -> None:
     if all(int(props[name]) == value for name, value in whole.items() if name in props):
         for name in [name for name in whole if name in props]:
             del props[name]
+
+
+def _pinhole(parsed: ParsedScene, sensor: JitArray) -> None:
+    """A lens of no size is a perspective camera; Mitsuba would take the smallest size instead, and say so."""
+    props = sensor.props
+    if "aperture_radius" in props and float(props["aperture_radius"]) == 0:
+        for name in [name for name in ("aperture_radius", "focus_distance") if name in props]:
+            del props[name]
+        props.set_plugin_name("perspective")
+        parsed.notes.append("thinlens with aperture_radius 0: drawn as a perspective camera")
 
 
 def plain(parsed: ParsedScene, *, btf_alone: bool = False) -> None:

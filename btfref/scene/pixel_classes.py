@@ -8,10 +8,10 @@ import numpy as np
 
 from btfref.conventions import PixelClass
 from btfref.scene.camera import film_rays, grid_offsets
-from btfref.scene.instances import every_shape
-from btfref.scene.lights import is_delta
+from btfref.scene.emitters.lights import is_delta
 from btfref.scene.loading import loaded
-from btfref.scene.materials import is_exact
+from btfref.scene.reading.instances import every_shape
+from btfref.scene.surfaces.materials import is_exact
 from btfref.types import JitArray, SceneLike
 
 #: A step between neighbouring samples that leaves the tangent plane by more than this share of a pixel's
@@ -76,7 +76,8 @@ def pixel_classes(
     jumps in depth between two of them (a fold in front of the cloth itself), or turns away from the view.
     *Mesostructure* are other pixels in which a material with a geometry of its own (a g-BRDF) jumps within `HIT` of a
     sample, under one of the scene's delta lights. All other pixels that are hit are *interior*. *Other* is every pixel
-    with a sample that sees a material of which real time shows the mean albedo (:mod:`btfref.scene.materials`).
+    with a sample that sees a material of which real time shows the mean albedo
+    (:mod:`btfref.scene.surfaces.materials`).
 
     Parameters
     ----------

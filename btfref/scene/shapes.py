@@ -11,9 +11,9 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.sphere.frames import Turn, nearest_turn
-from btfref.scene.instances import Where
-from btfref.scene.materials import PlainMaterial
-from btfref.scene.quadrics import KINDS, Quadric
+from btfref.scene.reading.instances import Where
+from btfref.scene.surfaces.materials import PlainMaterial
+from btfref.scene.surfaces.quadrics import KINDS, Quadric
 from btfref.types import JitArray, PathLike
 
 #: Segments of a full turn of a tessellated sphere, disk or cylinder: chords lie within 4e-5 radii of the
@@ -89,13 +89,13 @@ class MeshDescription:
         Plugin of the BSDF, for messages.
     to_world : ndarray, shape (4, 4)
         The shape's own transform, as written in the scene, and its instance's (the positions have it already).
-    where : btfref.scene.instances.Where
+    where : btfref.scene.reading.instances.Where
         Which of Mitsuba's shapes it is.
     emission : ndarray, shape (3,)
         Radiance of its own light on the side of its shading normal, in W/(m² sr).
-    quadric : btfref.scene.quadrics.Quadric or None
+    quadric : btfref.scene.surfaces.quadrics.Quadric or None
         Of a sphere, disk or cylinder, whose triangles are an approximation.
-    plain : btfref.scene.materials.PlainMaterial or None
+    plain : btfref.scene.surfaces.materials.PlainMaterial or None
         What is shown of a material that is no BTF.
     """
 
@@ -109,10 +109,15 @@ class MeshDescription:
     material: BtfMaterial | None
     bsdf: str
     to_world: np.ndarray
-    where: Where = Where(0)
+    where: Where = field(default_factory=lambda: Where(0))
     emission: np.ndarray = field(default_factory=lambda: np.zeros(3))
     quadric: Quadric | None = None
     plain: PlainMaterial | None = None
+
+    @property
+    def only_emits(self) -> bool:
+        """Whether it is a light without a material: Mitsuba then makes it black."""
+        return self.material is None and self.bsdf == "none" and bool(np.any(self.emission > 0))
 
     @property
     def shown(self) -> BtfMaterial | PlainMaterial:
@@ -231,7 +236,14 @@ def _unit(v: np.ndarray) -> np.ndarray:
 
 
 def triangles_of(
-    shape: JitArray, node: JitArray, *, file: PathLike, name: str, outer: np.ndarray, btf: bool = True
+    shape: JitArray,
+    node: JitArray,
+    *,
+    file: PathLike,
+    name: str,
+    outer: np.ndarray,
+    btf: bool = True,
+    bitmap: bool = False,
 ) -> dict[str, Any]:
     """Vertices of a shape, read from the instantiated mesh or tessellated.
 
@@ -246,8 +258,8 @@ def triangles_of(
         Of the shape, likewise.
     outer : ndarray, shape (4, 4)
         Transform of the instance that shows the shape.
-    btf : bool
-        Whether it shows a BTF, which needs texture coordinates of its own.
+    btf, bitmap : bool
+        Whether it shows a BTF, which needs texture coordinates of its own, or a bitmap.
 
     Returns
     -------
@@ -268,7 +280,7 @@ def triangles_of(
     if shape.is_mesh() and plugin not in _TESSELLATIONS:
         if not shape.has_vertex_texcoords() and btf:
             raise InputError("the shape has no texture coordinates", file=file, field=name, got=plugin)
-        if plugin == "obj" and btf:
+        if plugin == "obj" and (btf or bitmap):
             refuse_partial_uv(props["filename"], scene=file, name=name)
         arrays = mi.traverse(shape)
         normals, flip = None, bool(shape.has_flipped_normals())

@@ -17,7 +17,7 @@ import numpy as np
 from btfref.errors import BtfrefError, InputError, MissingDependencyError
 from btfref.rendering.gl import composer
 from btfref.representations.lookup import packed_arrays
-from btfref.scene.materials import PlainMaterial
+from btfref.scene.surfaces.materials import PlainMaterial
 from btfref.types import JitArray, PathLike
 
 if TYPE_CHECKING:

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from btfref.scene.quadrics import KINDS
+from btfref.scene.surfaces.quadrics import KINDS
 
 if TYPE_CHECKING:
     from btfref.scene.description import Camera
-    from btfref.scene.quadrics import Quadric
+    from btfref.scene.surfaces.quadrics import Quadric
 
 #: Of the rectangle that holds a shape: ``shaders/hosts/quadric.vert``.
 TRIANGLES = 2

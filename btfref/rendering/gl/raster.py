@@ -10,14 +10,14 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.rendering.environment_light.lighting import PASS
-from btfref.scene.lights import KINDS
+from btfref.scene.emitters.lights import KINDS
 from btfref.scene.shapes import neighbours
 
 if TYPE_CHECKING:
     from btfref.rendering.environment_light.prepared import Prepared
     from btfref.scene.description import Camera, Light
-    from btfref.scene.materials import PlainMaterial
     from btfref.scene.shapes import BtfMaterial, MeshDescription
+    from btfref.scene.surfaces.materials import PlainMaterial
     from btfref.types import Facts
 
 

@@ -29,8 +29,8 @@ from btfref.rendering.gl.raster import (
 )
 from btfref.scene.demand import MARGIN, kept_maps, number_kept
 from btfref.scene.description import SceneDescription, read_scene
-from btfref.scene.materials import PlainMaterial
 from btfref.scene.mirrored import mirrored_meshes
+from btfref.scene.surfaces.materials import PlainMaterial
 from btfref.types import Facts, JitArray, SceneLike
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 #: Gives the representation of a file.
 LoadFile = Callable[[str], "Representation"]
 
-#: Of what is shown: file or material, texel filter, the mesh where each has light of its own, and whether it is on a quadric.
+#: Of what is shown: file or material, texel filter, the mesh where each has light of its own, whether on a quadric.
 Key = tuple["str | PlainMaterial", str | None, int | None, bool]
 
 
@@ -96,11 +96,12 @@ def realtime(
     -------
     RenderResult
         A sample's footprint, and so the level of detail of methods that have levels, is that of 1/n of a pixel.
-        ``meta["mirrored"]`` names the shapes whose texture is mirrored; ``other_materials`` those whose material is drawn
-        as its mean albedo, with its plugin (:mod:`btfref.scene.materials`); ``meta["frame_ms"]`` is the median time of one
-        frame (one sample a pixel), GPU timer and wall clock whichever is longer; ``gl_vendor``, ``gl_renderer``,
-        ``gl_version``; ``negative_fraction``, the share of channels below zero, and ``not_finite``, their number:
-        nothing is clamped; ``kept``, how many maps were kept by file. With an environment ``environment_path``, the way
+        ``meta["mirrored"]`` names the shapes whose texture is mirrored; ``other_materials`` those whose material is
+        drawn as its mean albedo, with its plugin (:mod:`btfref.scene.surfaces.materials`); ``frame_ms`` is the median
+        time of one frame (one sample a pixel), GPU timer and wall clock whichever is longer; ``gl_vendor``,
+        ``gl_renderer``, ``gl_version``; ``negative_fraction``, the share of channels below zero, and ``not_finite``,
+        their number: nothing is clamped; ``kept``, how many maps were kept by file. With an environment
+        ``environment_path``, the way
         taken, and what it says of itself, such as ``environment_lights`` and their ``estimated_error``; by file where
         there are several.
 

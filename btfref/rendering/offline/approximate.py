@@ -20,8 +20,8 @@ from btfref.rendering.environment_light.lighting import lighting_of
 from btfref.representations.protocol import HasLevels
 from btfref.scene.description import read_scene
 from btfref.scene.hits import Hits, surfaces
-from btfref.scene.instances import drawn_shapes
 from btfref.scene.loading import loaded
+from btfref.scene.reading.instances import drawn_shapes
 from btfref.types import SceneLike
 
 if TYPE_CHECKING:

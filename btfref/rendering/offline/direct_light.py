@@ -7,9 +7,9 @@ import numpy as np
 from btfref.errors import InputError
 from btfref.numerics.device_arrays import to_device
 from btfref.rendering import RenderResult
-from btfref.scene.area_lights import AreaLights, area_lights
 from btfref.scene.camera import film_rays, grid_offsets
-from btfref.scene.lights import checked_emitters, is_area, is_delta
+from btfref.scene.emitters.area_lights import AreaLights, area_lights
+from btfref.scene.emitters.lights import checked_emitters, is_area, is_delta
 from btfref.types import Facts, JitArray
 
 #: Camera rays times samples that are traced at a time.
@@ -153,7 +153,7 @@ def _direct(
         light.delta if environment is None else light.delta | (light.emitter != mi.EmitterPtr(environment))
     )
     share = dr.select(alone, 1, heuristic(light.pdf, pdf))
-    result = _emission(scene, si, active) + dr.select(lit, weight * value * share, 0)
+    result = emission(scene, si, active) + dr.select(lit, weight * value * share, 0)
     if environment is not None:
         sampled, weight = bsdf.sample(context, si, lobe, of_bsdf, active)
         going = active & (sampled.pdf > 0)
@@ -254,7 +254,7 @@ def regular(
     return pictures, variance.T.reshape(height, width, 3).astype(np.float32), rounds * step * grid**2
 
 
-def _emission(scene: JitArray, si: JitArray, active: JitArray) -> JitArray:
+def emission(scene: JitArray, si: JitArray, active: JitArray) -> JitArray:
     """Radiance of the area lights that are seen themselves."""
     import drjit as dr
     import mitsuba as mi
@@ -313,7 +313,7 @@ def _exact(scene: JitArray, ray: JitArray, shadows: bool, areas: AreaLights) -> 
         facing = -dr.dot(towards, normal)
         return i + 1, sum_ + reflected(towards, place, power * (facing / square), valid & (facing > 0))
 
-    sum_ = dr.select(valid, _emission(scene, si, valid), dr.zeros(mi.Spectrum, dr.width(ray)))
+    sum_ = dr.select(valid, emission(scene, si, valid), dr.zeros(mi.Spectrum, dr.width(ray)))
     for body, count in ((of_delta, len(deltas)), (of_point, len(areas))):
         if count:
             start, n = dr.zeros(mi.UInt32, dr.width(ray)), dr.opaque(mi.UInt32, count)

@@ -9,7 +9,7 @@ uniform sampler2DArray scene_lights;
 uniform int light_first;  // light of this pass, and the one after its last
 uniform int light_end;
 
-// As btfref/scene/lights.py numbers them.
+// As btfref/scene/emitters/lights.py numbers them.
 const int LIGHT_DIRECTIONAL = 0, LIGHT_SPOT = 2, LIGHT_AREA = 3;
 
 vec3 light_incident(int i, vec3 point, out vec3 towards) {

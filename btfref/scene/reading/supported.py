@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from btfref.errors import InputError
-from btfref.scene.lights import DIRECTED
+from btfref.scene.emitters.lights import DIRECTED
 from btfref.scene.parsing import DELTA_LIGHTS, SURROUNDINGS, ParsedScene, is_kind
 from btfref.types import JitArray
 
 
-def check(parsed: ParsedScene, nodes: Mapping[str, list[JitArray]], shapes: Sequence[JitArray]) -> list[str]:
+def check(parsed: ParsedScene, nodes: Mapping[str, list[JitArray]], shapes: Sequence[JitArray]) -> None:
     """Refuse what real-time rendering does not have: sensors, films, lights, finished objects.
 
     Parameters
@@ -20,11 +20,6 @@ def check(parsed: ParsedScene, nodes: Mapping[str, list[JitArray]], shapes: Sequ
         Those of the scene itself, by kind: "Sensor", "Emitter".
     shapes : sequence of mitsuba.parser.SceneNode
         That are drawn.
-
-    Returns
-    -------
-    list of str
-        What is drawn otherwise than its name says, a line each.
 
     Raises
     ------
@@ -36,7 +31,7 @@ def check(parsed: ParsedScene, nodes: Mapping[str, list[JitArray]], shapes: Sequ
         raise InputError(
             "one sensor is needed", file=parsed.source, field="sensor", got=len(nodes["Sensor"]), expected=1
         )
-    notes = _check_sensor(parsed, nodes["Sensor"][0])
+    _check_sensor(parsed, nodes["Sensor"][0])
     for node in nodes["Emitter"]:
         _check_light(parsed, node, DELTA_LIGHTS + SURROUNDINGS)
     for node in shapes:
@@ -49,24 +44,23 @@ def check(parsed: ParsedScene, nodes: Mapping[str, list[JitArray]], shapes: Sequ
             made = type(value).__module__.startswith("mitsuba") and hasattr(value, "class_name")
             if made and not isinstance(value, mi.Bitmap):
                 raise InputError("the scene holds a finished Mitsuba object", file=parsed.source, field=key)
-    return notes
 
 
-def _check_sensor(parsed: ParsedScene, sensor: JitArray) -> list[str]:
-    """Refuse other sensors than pinholes of a whole film; what is said of a lens that is one."""
-    where, plugin, notes = parsed.location(sensor), sensor.props.plugin_name(), []
+def _check_sensor(parsed: ParsedScene, sensor: JitArray) -> None:
+    """Refuse other sensors than pinholes with a whole film."""
+    where, plugin = parsed.location(sensor), sensor.props.plugin_name()
     if plugin == "thinlens":
-        radius = float(sensor.props["aperture_radius"]) if "aperture_radius" in sensor.props else None
-        if radius != 0:
-            raise InputError(
-                "unsupported sensor: no depth of field in real time",
-                file=where,
-                field="aperture_radius",
-                got="none" if radius is None else f"{plugin} of {radius:g}",
-                expected="0, or a perspective sensor",
-            )
-        notes.append("thinlens of aperture_radius 0: a perspective camera")
-    elif plugin != "perspective":
+        radius = (
+            f" of {float(sensor.props['aperture_radius']):g}" if "aperture_radius" in sensor.props else ""
+        )
+        raise InputError(
+            "unsupported sensor: no depth of field in real time",
+            file=where,
+            field="aperture_radius",
+            got=plugin + radius,
+            expected="0, or a perspective sensor",
+        )
+    if plugin != "perspective":
         raise InputError("unsupported sensor", file=where, field="sensor", got=plugin, expected="perspective")
     for key in ("principal_point_offset_x", "principal_point_offset_y"):
         if key in sensor.props and float(sensor.props[key]) != 0:
@@ -75,7 +69,6 @@ def _check_sensor(parsed: ParsedScene, sensor: JitArray) -> list[str]:
         for key in ("crop_width", "crop_height", "crop_offset_x", "crop_offset_y"):
             if is_kind(film, "Film") and key in film.props:
                 raise InputError("cropped films are not supported", file=parsed.location(film), field=key)
-    return notes
 
 
 def _check_light(parsed: ParsedScene, node: JitArray, known: Sequence[str]) -> None:

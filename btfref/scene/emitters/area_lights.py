@@ -1,7 +1,7 @@
 """Points that stand for the area lights of a scene, so that their light is without noise.
 
-A Fibonacci lattice on the unit square, taken to the shape by Mitsuba's own uniform map: each point has the same share of
-the area. Their number follows from an estimated error, as for the directional lights that stand for an environment
+A Fibonacci lattice on the unit square, taken to the shape by Mitsuba's own uniform map: each point has the same share
+of the area. Their number follows from an estimated error, as for the directional lights that stand for an environment
 (:mod:`btfref.rendering.environment_light.light_set`), at receivers that the camera sees.
 """
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from btfref.conventions import LUMINANCE
-from btfref.scene.lights import Light, is_area
+from btfref.scene.emitters.lights import Light, is_area
 from btfref.types import Facts, JitArray
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ TARGET = 0.01
 FEWEST, MOST, TRUTH = 16, 1024, 8192
 
 #: Camera rays on each side of the picture that find receivers.
-RAYS = 16
+RAYS = 12
 
 #: Exponent of the receivers' lobe: cos³² is about as wide as measured lights are apart.
 EXPONENT = 32
@@ -99,9 +99,10 @@ def area_lights(scene: JitArray, types: ModuleType, *, target: float = TARGET) -
         found.append(points)
         errors, total = errors + error, total + mean
     if not found:
-        return AreaLights(*np.zeros((3, 0, 3)), 0.0)
-    joined = [np.concatenate(parts) for parts in zip(*found, strict=True)]
-    return AreaLights(*joined, errors / max(total, 1e-300))
+        nothing = np.zeros((0, 3))
+        return AreaLights(nothing, nothing, nothing, 0.0)
+    position, normal, power = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return AreaLights(position, normal, power, errors / max(total, 1e-300))
 
 
 def points_of(shape: JitArray, n: int, types: ModuleType) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -127,6 +128,10 @@ def points_of(shape: JitArray, n: int, types: ModuleType) -> tuple[np.ndarray, n
 
     rows = [_array(values, n) for values in _each(sampled, types, x, y)]
     position, normal, radiance = rows[:3]
+    if shape.class_name() == "Sphere":
+        # Mitsuba 3.9 leaves the rotation of a sphere out of these normals.
+        normal = position - np.array(shape.bbox().center(), float).reshape(3)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True) * (-1 if shape.has_flipped_normals() else 1)
     return position, normal, radiance / (n * rows[3][:, :1])
 
 

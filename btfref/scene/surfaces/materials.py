@@ -1,9 +1,9 @@
 """Materials beside BTFs: ``diffuse`` as it is, every other one as its mean albedo.
 
 What real-time rendering shows of a ``diffuse`` of one colour or with a ``bitmap``, one-sided or inside a ``twosided``,
-is Mitsuba's own. All other BSDFs are shown as a Lambertian surface of their albedo: the mean of what Mitsuba's ``sample``
-reflects, over the shape's area and over views of cosine distribution (the bihemispherical reflectance). Pixels that see
-one are of class *other*.
+is Mitsuba's own. All other BSDFs are shown as a Lambertian surface of their albedo: the mean of what Mitsuba's
+``sample`` reflects, over the shape's area and over views of cosine distribution (the bihemispherical reflectance).
+Pixels that see one are of class *other*.
 """
 
 from __future__ import annotations

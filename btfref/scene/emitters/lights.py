@@ -1,4 +1,4 @@
-"""Lights as data, and kinds of Mitsuba's emitters: seen from one direction at each point, of some extent, all around."""
+"""Lights as data, and kinds of Mitsuba's emitters: seen from one direction at each point, of some extent, all round."""
 
 from __future__ import annotations
 
@@ -139,19 +139,28 @@ def checked_emitters(scene: mi.Scene) -> list[mi.Emitter]:
 
     if not scene.emitters():
         raise InputError("the scene has no light", field="emitter")
+    refuse_directed(scene)
     for emitter in scene.emitters():
-        name = emitter.class_name()
-        if name == "DirectionalArea":
-            raise InputError("unsupported light", field="emitter", got="directionalarea", expected=DIRECTED)
         infinite = int(emitter.flags()) & int(mi.EmitterFlags.Infinite)
         if not (is_delta(emitter) or is_area(emitter) or infinite):
             raise InputError(
                 "unsupported light",
                 field="emitter",
-                got=name,
+                got=emitter.class_name(),
                 expected="point, spot, directional, area, constant, envmap or sunsky",
             )
     return scene.emitters()
+
+
+def refuse_directed(scene: mi.Scene) -> None:
+    """Refuse area lights that shine in one direction: paths that start at the camera never meet their light.
+
+    Raises
+    ------
+    InputError
+    """
+    if any(emitter.class_name() == "DirectionalArea" for emitter in scene.emitters()):
+        raise InputError("unsupported light", field="emitter", got="directionalarea", expected=DIRECTED)
 
 
 #: What takes the place of Mitsuba's ``directionalarea``.
