@@ -1,6 +1,7 @@
 """Render a Mitsuba scene with OpenGL: the real-time image.
 
-Meshes with BTF materials, a perspective camera, directional, point, spot and area lights, and an envmap, sunsky or
+Meshes, spheres, disks and cylinders with BTFs or other materials (diffuse exactly, the rest as their mean albedo), a
+perspective camera, directional, point, spot and area lights, and an envmap, sunsky or
 constant emitter. No cast shadows: compare with `btfref render --no-shadows`. The image is the mean of a regular
 sub-pixel grid (--grid).
 
