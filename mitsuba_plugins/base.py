@@ -20,6 +20,7 @@ from mitsuba_plugins.lib.footprint import LevelOfDetail
 from mitsuba_plugins.lib.frame import hand_of
 from mitsuba_plugins.lib.guide import LightGuide
 from mitsuba_plugins.lib.lookup import direction_table, valid_directions
+from mitsuba_plugins.lib.parameters import refuse_unknown
 from mitsuba_plugins.lib.proposals import Guided, Mixture
 from mitsuba_plugins.lib.tables import tensor
 from mitsuba_plugins.protocol import Displaced, LevelledEvaluator, Proposes
@@ -93,6 +94,7 @@ def make_bsdf() -> type:
             mi.BSDF.__init__(self, props)
             from btfref.representations import load
 
+            refuse_unknown(props.keys())
             self.filename = _parameter(props, "filename", None)
             if self.filename is None:
                 raise InputError("the plugin 'btf' needs a file", field="filename")

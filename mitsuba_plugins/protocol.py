@@ -127,7 +127,7 @@ def shown_by(bsdf: JitArray) -> list[ShowsMethod]:
     class Inner(mi.TraversalCallback):
         """Gathers the objects inside of one."""
 
-        def put(self, name: str, value: JitArray, flags: JitArray = None) -> None:
+        def put(self, name: str, value: JitArray, *flags: object) -> None:
             if isinstance(value, mi.BSDF):
                 found.append(value)
 

@@ -1,7 +1,9 @@
 """Render a Mitsuba scene with OpenGL: the real-time image.
 
-Meshes with BTF materials, a perspective camera, directional and point lights, and an envmap or constant emitter. No
-cast shadows: compare with `btfref render --no-shadows`. The image is the mean of a regular sub-pixel grid (--grid).
+Meshes, spheres, disks and cylinders with BTFs or other materials (diffuse exactly, the rest as their mean albedo), a
+perspective camera, directional, point, spot and area lights, and an envmap, sunsky or
+constant emitter. No cast shadows: compare with `btfref render --no-shadows`. The image is the mean of a regular
+sub-pixel grid (--grid).
 
 --environment says how an envmap lights: "prefiltered" maps, for the methods that have them, "lights", directional
 lights that stand for it, for any method, or "auto", the first of these that there is; "sh", spherical harmonics, for
@@ -23,7 +25,7 @@ from btfref.commands.shared.options import (
     add_scene,
     help_with_scenes,
 )
-from btfref.commands.shared.printing import emit, emit_json
+from btfref.commands.shared.printing import emit, emit_json, say_area_lights
 from btfref.commands.shared.reading import assignments, count, output_file
 from btfref.errors import DIRECTIONS, InputError
 from btfref.rendering.environment_light import PATHS
@@ -117,6 +119,9 @@ def run(args: Namespace) -> int:
             from btfref.scene.mirrored import line
 
             emit(line(meta["mirrored"]))
+        for note in meta["notes"]:
+            emit(f"note: {note}")
+        say_area_lights(meta)
         if "estimated_error" in meta:
             number = meta.get("environment_lights", meta.get("order"))
             kind = "lights" if "environment_lights" in meta else "bands"

@@ -2,7 +2,7 @@
 
 SCENE is a Mitsuba XML file, or one of the scenes that btfref ships.
 Any integrator; the film becomes float32 with a box filter. --grid N takes direct light alone, on a regular grid of
-N × N positions in each pixel: without random numbers where all lights are directional or points.
+N × N positions in each pixel: without random numbers but under an environment; points stand for area lights.
 --geometry shows the truth beyond every representation: the flat shape replaced by the mesostructure itself,
 path traced.
 """
@@ -20,7 +20,7 @@ from btfref.commands.shared.options import (
     add_seed,
     help_with_scenes,
 )
-from btfref.commands.shared.printing import emit
+from btfref.commands.shared.printing import emit, say_area_lights
 from btfref.commands.shared.reading import assignments, count, output_file
 from btfref.errors import SAMPLES, InputError
 
@@ -85,6 +85,7 @@ def run(args: Namespace) -> int:
         from btfref.scene.mirrored import line
 
         emit(line(result.meta["mirrored"]))
+    say_area_lights(result.meta)
     classes = None
     if classes_out:
         from btfref.scene.pixel_classes import pixel_classes

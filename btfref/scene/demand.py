@@ -166,6 +166,7 @@ def demand(
     from btfref.scene.description import read_scene
     from btfref.scene.hits import surfaces
     from btfref.scene.loading import loaded
+    from btfref.scene.reading.instances import drawn_shapes
 
     if description is None:
         description = read_scene(scene, parameters, size=size, missing_btf=shape is not None)
@@ -174,15 +175,18 @@ def demand(
     for mesh in description.meshes:
         if mesh.material is not None and mesh.material.filename not in wanted:
             wanted[mesh.material.filename] = Touched(mesh.material.filename, shape, least)
-    from_everywhere = description.environment is not None
+    # Of area lights too: which directions they have is not followed.
+    areas = any(light.kind == "area" for light in description.lights)
+    from_everywhere = description.environment is not None or areas
     with loaded(scene, parameters, size=size, plain=True) as made:
         # Samples of the next pixel are ``grid`` samples away.
         beside = None
         if margin is None:
             beside = int(made.sensors()[0].film().crop_size()[0]), min(1.0, 2 / grid)
         camera, angle = description.camera, description.camera.pixel_angle / grid
+        shapes = drawn_shapes(made, [mesh.where for mesh in description.meshes])
         for number, surface in enumerate(surfaces(made, grid)):
-            for mesh, one in zip(description.meshes, made.shapes(), strict=True):
+            for mesh, one in zip(description.meshes, shapes, strict=True):
                 if mesh.material is not None:
                     wanted[mesh.material.filename].add(surface, one, mesh.material, camera, angle, beside)
             if progress is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import ModuleType
 
 import numpy as np
@@ -12,9 +12,14 @@ import numpy as np
 from btfref.errors import InputError, MissingDependencyError
 from btfref.platform import prepare_llvm
 from btfref.scene import parsing
-from btfref.scene.environment import Environment, from_emitter
+from btfref.scene.emitters.area_lights import area_lights
+from btfref.scene.emitters.lights import Light, is_area, light_of
+from btfref.scene.environment import SUN_APERTURE, Environment, from_emitter
+from btfref.scene.reading.instances import drawn_nodes, drawn_shapes
+from btfref.scene.reading.supported import check
 from btfref.scene.shapes import BtfMaterial, MeshDescription, triangles_of
-from btfref.types import JitArray, SceneLike
+from btfref.scene.surfaces.materials import PlainMaterials, bitmap_of
+from btfref.types import Facts, JitArray, SceneLike
 
 __all__ = ["BtfMaterial", "Camera", "Light", "MeshDescription", "SceneDescription", "read_scene"]
 
@@ -81,24 +86,6 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class Light:
-    """A delta light.
-
-    Parameters
-    ----------
-    kind : {"directional", "point"}
-    position : ndarray, shape (3,)
-        Unit vector *towards* a directional light; position of a point light.
-    power : ndarray, shape (3,)
-        Irradiance on a plane that faces the light in W/m², or radiant intensity in W/sr; linear RGB.
-    """
-
-    kind: str
-    position: np.ndarray
-    power: np.ndarray
-
-
-@dataclass(frozen=True)
 class SceneDescription:
     """A scene as data.
 
@@ -110,6 +97,10 @@ class SceneDescription:
     source : str
         The scene file, for messages.
     environment : btfref.scene.environment.Environment or None
+    facts : dict
+        How many points stand for the area lights, and their estimated error: JSON-able.
+    notes : tuple of str
+        What is drawn otherwise than its name says, a line each.
     """
 
     camera: Camera
@@ -117,18 +108,8 @@ class SceneDescription:
     lights: tuple[Light, ...]
     source: str
     environment: Environment | None = None
-
-    def demand_btfs(self, what: str) -> None:
-        """Refuse shapes without a BTF, in the name of ``what``.
-
-        Raises
-        ------
-        InputError
-        """
-        for mesh in self.meshes:
-            if mesh.material is None:
-                where = f"{self.source}: shape {mesh.name}"
-                raise InputError(f"{what} needs a btf material", file=where, field="bsdf", got=mesh.bsdf)
+    facts: Facts = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
 def read_scene(
@@ -168,29 +149,42 @@ def read_scene(
     types = parsing.scalar_types()
     parsed = parsing.parse(scene, parameters, variant=VARIANT, size=size, missing_btf=missing_btf)
     roots = parsed.children(parsed.state.root)
-    nodes = {
-        kind: [n for _, n in roots if parsing.is_kind(n, kind)] for kind in ("Sensor", "Emitter", "Shape")
-    }
-    parsing.check(parsed, nodes)
-    materials = [parsing.material_of(parsed, node) for node in nodes["Shape"]]
-    parsing.plain(parsed)
+    nodes = {kind: [n for _, n in roots if parsing.is_kind(n, kind)] for kind in ("Sensor", "Emitter")}
+    drawn = drawn_nodes(parsed, [(i, n) for i, n in roots if parsing.is_kind(n, "Shape")])
+    check(parsed, nodes, [one.node for one in drawn])
+    apart = [(parsed.location(n), n.props.plugin_name(), _aperture(n)) for n in nodes["Emitter"]]
+    materials = [parsing.material_of(parsed, one.node) for one in drawn]
+    bitmaps = [bitmap_of(parsed, one.node) for one in drawn]
+    parsing.plain(parsed, btf_alone=True)
     made = parsed.instantiate()
-    if not isinstance(made, types.Scene) or len(made.shapes()) != len(nodes["Shape"]):
+    if not isinstance(made, types.Scene) or len(made.shapes()) != len({one.where.number for one in drawn}):
         raise InputError("the file does not describe one scene of separate shapes", file=parsed.source)
-    meshes = []
-    for shape, node, (bsdf, material) in zip(made.shapes(), nodes["Shape"], materials, strict=True):
-        data = triangles_of(shape, node, file=parsed.location(node))
-        name, plugin = shape.id(), node.props.plugin_name()
-        meshes.append(MeshDescription(name=name, plugin=plugin, bsdf=bsdf, material=material, **data))
+    shapes = [one.shape for one in drawn_shapes(made, [one.where for one in drawn])]
+    meshes, plain = [], PlainMaterials(types)
+    for shape, one, (bsdf, material), bitmap in zip(shapes, drawn, materials, bitmaps, strict=True):
+        name, file = one.name(shape.id() or one.node.props.plugin_name()), parsed.location(one.node)
+        looked_up = {"btf": material is not None, "bitmap": bitmap is not None}
+        data = triangles_of(shape, one.node, file=file, name=name, outer=one.outer, **looked_up)
+        if material is None:
+            data["plain"] = plain.of(shape, bitmap, file=file, name=name)
+            parsed.notes += plain.note(data["plain"], name, bsdf)
+        plugin = one.node.props.plugin_name()
+        data["emission"] = _emission(shape, types)
+        data |= {"name": name, "plugin": plugin, "bsdf": bsdf, "material": material, "where": one.where}
+        meshes.append(MeshDescription(**data))
     lights, environment = [], None
-    for node, emitter in zip(nodes["Emitter"], made.emitters(), strict=True):
-        kind = node.props.plugin_name()
+    emitters = [emitter for emitter in made.emitters() if not is_area(emitter)]
+    for (file, kind, aperture), emitter in zip(apart, emitters, strict=True):
         if kind in parsing.SURROUNDINGS:
-            environment = from_emitter(kind, emitter, types, file=parsed.location(node))
+            environment = from_emitter(kind, emitter, types, file=file, aperture=aperture)
         else:
-            lights.append(_light(kind, emitter, types))
+            lights.append(light_of(kind, emitter, types))
+    areas = area_lights(made, types)
+    lights += areas.lights()
     camera = _camera(made.sensors()[0])
-    return SceneDescription(camera, tuple(meshes), tuple(lights), parsed.source, environment)
+    return SceneDescription(
+        camera, tuple(meshes), tuple(lights), parsed.source, environment, areas.facts, tuple(parsed.notes)
+    )
 
 
 def _camera(sensor: JitArray) -> Camera:
@@ -203,14 +197,15 @@ def _camera(sensor: JitArray) -> Camera:
     return Camera(to_world, float(np.radians(float(values["x_fov"]))), width, height, *clip)
 
 
-def _light(kind: str, emitter: JitArray, types: ModuleType) -> Light:
-    """What the emitter sends, asked of Mitsuba itself: spectra and transforms are then its own."""
-    point = types.SurfaceInteraction3f()
-    point.p = [0.0, 0.0, 0.0]
-    sample, weight = emitter.sample_direction(point, [0.5, 0.5], True)
-    if kind == "directional":
-        return Light(kind, np.array(sample.d, float), np.array(weight, float))
-    position = np.array(sample.p, float)
-    point.p = (position + np.array([1.0, 0.0, 0.0])).tolist()
-    sample, weight = emitter.sample_direction(point, [0.5, 0.5], True)
-    return Light(kind, position, np.array(weight, float) * float(sample.dist) ** 2)
+def _emission(shape: JitArray, types: ModuleType) -> np.ndarray:
+    """Radiance of a shape's own light, shape (3,)."""
+    if not shape.is_emitter():
+        return np.zeros(3)
+    si = types.SurfaceInteraction3f()
+    si.wi = [0.0, 0.0, 1.0]
+    return np.array(shape.emitter().eval(si, True), float).ravel()[:3]
+
+
+def _aperture(node: JitArray) -> float:
+    """Angle that the sun of a sky subtends, in degrees: Mitsuba's emitter does not tell it."""
+    return float(node.props["sun_aperture"]) if "sun_aperture" in node.props else SUN_APERTURE

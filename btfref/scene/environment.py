@@ -21,6 +21,12 @@ from btfref.types import JitArray, PathLike
 #: Rows of the samples of a sun and sky: 0.18 degrees, a third of the sun's diameter.
 SUN_ROWS = 1000
 
+#: Rows and columns of the picture of a scene's own sun and sky, and samples along each side of a texel with the sun.
+SKY, SUN_SAMPLES = (256, 512), 24
+
+#: Angle that the sun subtends in Mitsuba's ``sunsky``, in degrees.
+SUN_APERTURE = 0.5358
+
 #: Rows of the cells that stand for a picture of any size when it is filtered: 1.4 degrees a cell.
 CELL_ROWS = 128
 
@@ -255,27 +261,69 @@ def sunsky(
     return Environment(sky.astype(np.float32), to_world, "sunsky")
 
 
+def _sky_picture(emitter: JitArray, types: ModuleType, values: JitArray, aperture: float) -> Environment:
+    """A sun and sky of a scalar variant as a picture with the zenith at its upper edge."""
+    rows, columns = SKY
+    to_world = np.array(values["to_world"].matrix, float).reshape(4, 4)[:3, :3]
+    # The picture has y up, the emitter's own frame z.
+    frame = to_world / np.linalg.norm(to_world, axis=0) @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    sun = np.array(values["sun_direction"], float).reshape(3)
+    sun = frame.T @ sun / np.linalg.norm(sun)  # given in world space
+
+    def directions(row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        v, u = np.pi * row / (rows - 1), 2 * np.pi * (column + 0.5) / columns
+        return np.stack([np.sin(v) * np.sin(u), np.cos(v), -np.sin(v) * np.cos(u)], -1)
+
+    def seen(d: np.ndarray) -> np.ndarray:
+        si, found = types.SurfaceInteraction3f(), np.zeros(d.shape)
+        for k, w in enumerate((-d @ frame.T).tolist()):
+            si.wi = w
+            found[k] = emitter.eval(si, True)
+        return np.maximum(found, 0)
+
+    row, column = (a.ravel() for a in np.mgrid[:rows, :columns].astype(float))
+    d = directions(row, column)
+    picture = seen(d)
+    inside = (np.arange(SUN_SAMPLES) + 0.5) / SUN_SAMPLES - 0.5
+    reach = np.cos(np.radians(0.5 * aperture) + 1.5 * np.pi / (rows - 1))
+    for k in np.flatnonzero(d @ sun > reach):
+        y, x = np.meshgrid(np.clip(row[k] + inside, 0, rows - 1), column[k] + inside, indexing="ij")
+        picture[k] = seen(directions(y.ravel(), x.ravel())).mean(0)
+    return Environment(picture.reshape(rows, columns, 3).astype(np.float32), frame, "sunsky")
+
+
 def from_emitter(
-    kind: str, emitter: JitArray, types: ModuleType, *, file: PathLike | None = None
+    kind: str,
+    emitter: JitArray,
+    types: ModuleType,
+    *,
+    file: PathLike | None = None,
+    aperture: float = SUN_APERTURE,
 ) -> Environment:
     """The environment of a Mitsuba emitter, asked of the emitter itself.
 
     Parameters
     ----------
-    kind : {"envmap", "constant"}
+    kind : {"envmap", "constant", "sunsky"}
     emitter : mitsuba.Emitter
     types : module
         Mitsuba's types of the emitter's variant.
     file : str, optional
         For messages.
+    aperture : float
+        Angle that the sun of a "sunsky" subtends, in degrees.
 
     Returns
     -------
     Environment
+        Of a "sunsky" a picture, `SKY` texels, each the mean over its extent where the sun is: its energy and its middle
+        are kept, its edge is that of a texel.
     """
     import mitsuba as mi
 
     values = mi.traverse(emitter)
+    if kind == "sunsky":
+        return _sky_picture(emitter, types, values, aperture)
     if kind == "constant":
         si = types.SurfaceInteraction3f()
         return constant(np.array(emitter.eval(si), float).ravel()[:3])

@@ -9,7 +9,7 @@ import numpy as np
 from btfref.conventions import texel_stencil
 from btfref.numerics.sphere import interpolation
 from btfref.scene.hits import Hits
-from btfref.types import JitArray, PathLike
+from btfref.types import PathLike
 
 if TYPE_CHECKING:
     from btfref.numerics.sphere.directions import DirectionSet
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from btfref.representations.protocol import SeesTexels
     from btfref.scene.description import Camera
     from btfref.scene.hits import Surface
+    from btfref.scene.reading.instances import Drawn
     from btfref.scene.shapes import BtfMaterial
 
 
@@ -75,7 +76,7 @@ class Touched:
     def add(
         self,
         surface: Surface,
-        shape: JitArray,
+        drawn: Drawn,
         material: BtfMaterial,
         camera: Camera,
         angle: float,
@@ -86,7 +87,7 @@ class Touched:
         Parameters
         ----------
         surface : Surface
-        shape : mitsuba.Shape
+        drawn : btfref.scene.reading.instances.Drawn
         material : BtfMaterial
             The shape's.
         camera : Camera
@@ -95,7 +96,7 @@ class Touched:
         beside : (int, float), optional
             Width of the picture, and share of the changes from pixel to pixel that is margin.
         """
-        seen = surface.sees(shape)
+        seen = surface.sees(drawn)
         hits = Hits.of(surface, material, np.flatnonzero(seen))
         front = hits.w_view[:, 2] > -self.margin
         if not front.any():

@@ -20,9 +20,11 @@ from btfref.errors import InputError
 from btfref.numerics.footprint import TINY, cone_footprint
 from btfref.numerics.sphere.frames import Turn, shading_frame
 from btfref.scene.camera import film_rays, grid_offsets
+from btfref.scene.emitters.lights import is_delta
 from btfref.types import JitArray
 
 if TYPE_CHECKING:
+    from btfref.scene.reading.instances import Drawn
     from btfref.scene.shapes import BtfMaterial, MeshDescription
 
 #: Shapes whose triangles are a tessellation of ours.
@@ -70,14 +72,18 @@ class Surface:
         """Directions towards every delta light in Mitsuba's frame, each of shape (pixels, 3)."""
         import mitsuba as mi
 
-        found = [light.sample_direction(self.si, mi.Point2f(0.5))[0] for light in self._scene.emitters()]
+        lights = [light for light in self._scene.emitters() if is_delta(light)]
+        found = [light.sample_direction(self.si, mi.Point2f(0.5))[0] for light in lights]
         return [np.array(self.si.to_local(sample.d), float).T for sample in found]
 
-    def sees(self, shape: JitArray) -> np.ndarray:
+    def sees(self, drawn: Drawn) -> np.ndarray:
         """Which pixels see a shape, shape (pixels,) bool."""
         import mitsuba as mi
 
-        return self.hit & np.array(self.si.shape == mi.ShapePtr(shape))
+        seen = self.hit & np.array(self.si.shape == mi.ShapePtr(drawn.shape))
+        if drawn.instance is not None:
+            seen &= np.array(self.si.instance == mi.ShapePtr(drawn.instance))
+        return seen
 
 
 def surfaces(scene: JitArray, grid: int) -> Iterator[Surface]:

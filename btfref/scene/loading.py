@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 from btfref.errors import InputError
 from btfref.sampling.variant import no_collection
 from btfref.scene import parsing
+from btfref.scene.reading.instances import every_shape
+from btfref.scene.shapes import refuse_partial_uv
 from btfref.types import JitArray, SceneLike
 
 if TYPE_CHECKING:
@@ -72,7 +74,9 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
                 parsing.plain(parsed)
             if sampled is None:
                 lights = [node for node in parsed.nodes if parsing.is_kind(node, "Emitter")]
-                sampled = any(node.props.plugin_name() not in parsing.DELTA_LIGHTS for node in lights)
+                sampled = any(
+                    node.props.plugin_name() not in (*parsing.DELTA_LIGHTS, "area") for node in lights
+                )
             for node in parsed.nodes:
                 if node.props.plugin_name() != parsing.BTF:
                     continue
@@ -100,19 +104,29 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
 
 
 def _btf_shapes(parsed: ParsedScene) -> dict[str, str]:
-    """Identifier → place of every shape with a BTF; to be asked before instantiation consumes the tree."""
+    """Identifier → place of every shape with a BTF; to be asked before instantiation consumes the tree.
+
+    Raises
+    ------
+    InputError
+        For an OBJ file with texture coordinates at some of its faces.
+    """
 
     def shows_btf(node: JitArray) -> bool:
         materials = [child for _, child in parsed.children(node) if parsing.is_kind(child, "BSDF")]
         return any(node.props.plugin_name() == parsing.BTF or shows_btf(node) for node in materials)
 
     shapes = [node for node in parsed.nodes if parsing.is_kind(node, "Shape") and shows_btf(node)]
+    for node in shapes:
+        if node.props.plugin_name() == "obj" and "filename" in node.props:
+            name = node.props.id() or "obj"
+            refuse_partial_uv(node.props["filename"], scene=parsed.location(node), name=name)
     return {node.props.id(): parsed.location(node) for node in shapes}
 
 
 def _demand_texture_coordinates(made: JitArray, btf_shapes: dict[str, str]) -> None:
     """Refuse meshes with a BTF but no uv: Mitsuba would use the triangles' barycentric coordinates."""
-    for shape in made.shapes():
+    for shape in every_shape(made):
         if shape.id() in btf_shapes and shape.is_mesh() and not shape.has_vertex_texcoords():
             place = btf_shapes[shape.id()]
             raise InputError("the shape has no texture coordinates", file=place, field=shape.id())

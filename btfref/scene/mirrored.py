@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from btfref.scene.camera import film_rays
+from btfref.scene.reading.instances import every_shape
 from btfref.types import JitArray
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def seen_mirrored(scene: JitArray) -> list[str]:
     from mitsuba_plugins.lib.frame import hand_of
     from mitsuba_plugins.protocol import shown_by
 
-    turns = [(shape, {one.turn.hand for one in shown_by(shape.bsdf())}) for shape in scene.shapes()]
+    turns = [(shape, {one.turn.hand for one in shown_by(shape.bsdf())}) for shape in every_shape(scene)]
     if not any(hands for _, hands in turns):
         return []
     si = scene.ray_intersect(film_rays(scene.sensors()[0], (0.5, 0.5))[0])
@@ -43,7 +44,7 @@ def seen_mirrored(scene: JitArray) -> list[str]:
     dr.eval(shape_seen, hand)
     seen = set(zip(np.array(shape_seen).tolist(), np.array(hand).tolist(), strict=True))
     return [
-        shape.id()
+        shape.id() or shape.class_name().lower()
         for shape, hands in turns
         if any((int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]), -h) in seen for h in hands)
     ]
@@ -54,8 +55,13 @@ def mirrored_meshes(meshes: Sequence[MeshDescription]) -> list[str]:
     return [
         mesh.name
         for mesh in meshes
-        if mesh.material is not None and (mesh.hands() * mesh.material.turn.hand < 0).any()
+        if mesh.material is not None and (_hands(mesh) * mesh.material.turn.hand < 0).any()
     ]
+
+
+def _hands(mesh: MeshDescription) -> np.ndarray:
+    """Signs of det(∂p/∂u, ∂p/∂v, n) that occur."""
+    return mesh.hands() if mesh.quadric is None else np.array(np.prod(mesh.quadric.sides))
 
 
 def line(names: Sequence[str]) -> str:

@@ -6,6 +6,7 @@ one with search paths of its own, is left to it.
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -76,6 +77,31 @@ def nodes(
         if node.tag == "include":
             name = filled(node.attrib.get("filename", ""), values | dict(parameters))
             yield from nodes(file.parent / name, values, parameters)
+
+
+def search_paths(file: Path, parameters: Mapping[str, str]) -> list[Path]:
+    """Folders that a scene names with ``<path value="…"/>``, for files that are not beside it.
+
+    Parameters
+    ----------
+    file : pathlib.Path
+        The scene, Mitsuba XML.
+    parameters : mapping of str to str
+        Values for ``$name`` in the file.
+
+    Returns
+    -------
+    list of pathlib.Path
+        In their order; those that are there.
+    """
+    values: dict[str, str] = {}
+    found = []
+    with contextlib.suppress(ElementTree.ParseError, OSError, UnicodeDecodeError):
+        for path, node in nodes(file, values, parameters):
+            if node.tag == "path":
+                text = filled(node.attrib.get("value", ""), values | dict(parameters))
+                found += [folder for folder in (path.parent / text, Path(text)) if folder.is_dir()][:1]
+    return found
 
 
 def filled(text: str, values: Mapping[str, str]) -> str:

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import importlib
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 
@@ -19,13 +19,21 @@ from btfref.numerics.footprint import MODES
 from btfref.numerics.sphere.frames import uv_transform
 from btfref.platform import set_variant
 from btfref.representations.file.container import refuse_store
-from btfref.scene.parameters import check_parameters
+from btfref.scene.parameters import check_parameters, search_paths
+from btfref.scene.reading.instances import without_merges
 from btfref.scene.shapes import BtfMaterial
 from btfref.scene.shipped import ENVIRONMENTS, scene_file
 from btfref.types import JitArray, SceneLike
+from mitsuba_plugins.lib.parameters import refuse_unknown
 
 #: Emitters that shine on each point from one direction, and those infinitely far away on all sides: one at most.
-DELTA_LIGHTS, SURROUNDINGS = ("directional", "point"), ("envmap", "constant")
+DELTA_LIGHTS, SURROUNDINGS = ("directional", "point", "spot"), ("envmap", "constant", "sunsky")
+
+#: Emitters of earlier Mitsubas that became settings of another one.
+_RENAMED = {"sky": "sunsky with sun_scale 0", "sun": "sunsky with sky_scale 0"}
+
+#: Size of Mitsuba's films by default.
+_FILM = (("width", 768), ("height", 576))
 
 #: The BSDF plugin that shows a representation.
 BTF = "btf"
@@ -41,11 +49,14 @@ class ParsedScene:
     config : mitsuba.parser.ParserConfig
     source : str
         The scene file, or "scene dictionary".
+    notes : list of str
+        What is drawn otherwise than its name says, a line each.
     """
 
     state: JitArray
     config: JitArray
     source: str
+    notes: list[str] = field(default_factory=list)
 
     @property
     def nodes(self) -> JitArray:
@@ -63,12 +74,13 @@ class ParsedScene:
 
     def children(self, node: JitArray) -> list[tuple[int, JitArray]]:
         """Nodes that ``node`` refers to, in their order, as ``(index, node)``."""
-        result = []
-        for key in node.props.keys():
-            value = node.props[key]
-            if type(value).__name__ == "ResolvedReference":
-                result.append((value.index(), self.nodes[value.index()]))
-        return result
+        return [(index, self.nodes[index]) for index in self.references(node).values()]
+
+    def references(self, node: JitArray) -> dict[str, int]:
+        """Names of a node's settings that are nodes, and the indices of these, in their order."""
+        values = {key: node.props[key] for key in node.props.keys()}
+        # Colours take any name for a swizzle, "index" too.
+        return {k: v.index() for k, v in values.items() if type(v).__name__ == "ResolvedReference"}
 
     def instantiate(self) -> JitArray:
         """The Mitsuba scene.
@@ -184,8 +196,23 @@ def parse(
     except (RuntimeError, ValueError, TypeError) as error:
         raise InputError(one_line(error), file=source) from error
     parsed = ParsedScene(state, config, source)
+    without_merges(parsed)
     for node in parsed.nodes:
-        _resolve_file(parsed, node, None if file is None else file.resolve().parent, missing_btf)
+        if (plugin := node.props.plugin_name()) in _RENAMED and not _is(node, "Shape"):
+            raise InputError(
+                "Mitsuba 3 has no such light",
+                file=parsed.location(node),
+                field="emitter",
+                got=plugin,
+                expected=_RENAMED[plugin],
+            )
+    beside = [] if file is None else [file.resolve().parent, *search_paths(file, values)]
+    for node in parsed.nodes:
+        _resolve_file(parsed, node, beside, missing_btf)
+        if _is(node, "Film"):
+            _whole_film(node)
+        if node.props.plugin_name() == "thinlens":
+            _pinhole(parsed, node)
         if _is(node, "Film") and size is not None:
             node.props["width"], node.props["height"] = int(size[0]), int(size[1])
         if _is(node, "Film") and all(name in node.props for name in ("width", "height")):
@@ -195,14 +222,37 @@ def parse(
     return parsed
 
 
-def plain(parsed: ParsedScene) -> None:
-    """Replace what the geometry does not need, so that no material, texture or integrator is loaded."""
+def _whole_film(film: JitArray) -> None:
+    """Leave out a crop window that is the whole film."""
+    props = film.props
+    size = [int(props[name]) if name in props else default for name, default in _FILM]
+    whole = {"crop_offset_x": 0, "crop_offset_y": 0, "crop_width": size[0], "crop_height": size[1]}
+    if all(int(props[name]) == value for name, value in whole.items() if name in props):
+        for name in [name for name in whole if name in props]:
+            del props[name]
+
+
+def _pinhole(parsed: ParsedScene, sensor: JitArray) -> None:
+    """A lens of no size is a perspective camera; Mitsuba would take the smallest size instead, and say so."""
+    props = sensor.props
+    if "aperture_radius" in props and float(props["aperture_radius"]) == 0:
+        for name in [name for name in ("aperture_radius", "focus_distance") if name in props]:
+            del props[name]
+        props.set_plugin_name("perspective")
+        parsed.notes.append("thinlens with aperture_radius 0: drawn as a perspective camera")
+
+
+def plain(parsed: ParsedScene, *, btf_alone: bool = False) -> None:
+    """Replace what the geometry does not need, so that no material, texture or integrator is loaded.
+
+    With ``btf_alone`` other materials than BTFs stay.
+    """
     import mitsuba as mi
 
     for node in parsed.nodes:
         kinds = {"BSDF": "diffuse", "Integrator": "direct"}
         kind = next((k for k in kinds if is_kind(node, k)), None)
-        if kind:
+        if kind and not (btf_alone and kind == "BSDF" and node.props.plugin_name() != BTF):
             for key in list(node.props.keys()):
                 del node.props[key]
             node.props.set_plugin_name(kinds[kind])
@@ -222,24 +272,26 @@ def is_kind(node: JitArray, kind: str) -> bool:
 
 
 def _resolve_file(
-    parsed: ParsedScene, node: JitArray, beside: Path | None, missing_btf: bool = False
+    parsed: ParsedScene, node: JitArray, beside: Sequence[Path], missing_btf: bool = False
 ) -> None:
     """Make the node's relative file name absolute.
 
-    Mitsuba looks beside the scene file only when it loads the file itself. BTF files come from the command
-    line, so that the current directory goes first for them.
+    Mitsuba looks beside the scene file, and in the folders that it names, only when it loads the file itself. BTF files
+    come from the command line, so that the current directory goes first for them.
     """
     is_btf = node.props.plugin_name() == BTF
+    if is_btf:
+        refuse_unknown(node.props.keys(), file=parsed.location(node))
     name = node.props["filename"] if "filename" in node.props else None
     if not isinstance(name, str) or not name:
         if is_btf:
             raise InputError("a btf material without a file", file=parsed.location(node), field="filename")
         return
-    for directory in (Path.cwd(), beside) if is_btf else (beside, Path.cwd()):
-        if directory is not None and (directory / name).is_file():
+    for directory in (Path.cwd(), *beside) if is_btf else (*beside, Path.cwd()):
+        if (directory / name).is_file():
             node.props["filename"] = str((directory / name).resolve())
             return
-        if is_btf and directory is not None:
+        if is_btf:
             refuse_store(directory / name)
     if node.props.plugin_name() == "envmap":
         _shipped_environment(parsed, node, name)
@@ -262,62 +314,6 @@ def _shipped_environment(parsed: ParsedScene, node: JitArray, name: str) -> None
     node.props["bitmap"] = mi.Bitmap(np.ascontiguousarray(shipped(name).radiance))
 
 
-def check(parsed: ParsedScene, nodes: Mapping[str, list[JitArray]]) -> None:
-    """Refuse what real-time rendering does not have: sensors, films, lights, finished objects.
-
-    Parameters
-    ----------
-    parsed : ParsedScene
-    nodes : dict of str to list of mitsuba.parser.SceneNode
-        Those of the scene itself, by kind: "Sensor", "Emitter", "Shape".
-
-    Raises
-    ------
-    InputError
-    """
-    import mitsuba as mi
-
-    if len(nodes["Sensor"]) != 1:
-        raise InputError(
-            "one sensor is needed", file=parsed.source, field="sensor", got=len(nodes["Sensor"]), expected=1
-        )
-    sensor = nodes["Sensor"][0]
-    if sensor.props.plugin_name() != "perspective":
-        where, got = parsed.location(sensor), sensor.props.plugin_name()
-        raise InputError("unsupported sensor", file=where, field="sensor", got=got, expected="perspective")
-    for key in ("principal_point_offset_x", "principal_point_offset_y"):
-        if key in sensor.props and float(sensor.props[key]) != 0:
-            raise InputError(
-                "unsupported sensor setting", file=parsed.location(sensor), field=key, expected=0
-            )
-    for _, film in parsed.children(sensor):
-        for key in ("crop_width", "crop_height", "crop_offset_x", "crop_offset_y"):
-            if is_kind(film, "Film") and key in film.props:
-                raise InputError("cropped films are not supported", file=parsed.location(film), field=key)
-    for node in nodes["Emitter"]:
-        if node.props.plugin_name() not in DELTA_LIGHTS + SURROUNDINGS:
-            where, got = parsed.location(node), node.props.plugin_name()
-            expected = " or ".join(DELTA_LIGHTS + SURROUNDINGS)
-            raise InputError("unsupported light", file=where, field="emitter", got=got, expected=expected)
-    for node in nodes["Shape"]:
-        for _, child in parsed.children(node):
-            if is_kind(child, "Emitter"):
-                where, got = parsed.location(child), child.props.plugin_name()
-                raise InputError(
-                    "unsupported light",
-                    file=where,
-                    field="emitter",
-                    got=got,
-                    expected=" or ".join(DELTA_LIGHTS),
-                )
-    for node in parsed.nodes:
-        # Objects that were made before cannot be read under another variant.
-        for key, value in node.props.items():
-            made = type(value).__module__.startswith("mitsuba") and hasattr(value, "class_name")
-            if made and not isinstance(value, mi.Bitmap):
-                raise InputError("the scene holds a finished Mitsuba object", file=parsed.source, field=key)
-
-
 def material_of(parsed: ParsedScene, shape: JitArray) -> tuple[str, BtfMaterial | None]:
     """Plugin name of the shape's BSDF, and the BTF material if it is one.
 
@@ -333,7 +329,9 @@ def material_of(parsed: ParsedScene, shape: JitArray) -> tuple[str, BtfMaterial 
     """
     bsdfs = [child for _, child in parsed.children(shape) if is_kind(child, "BSDF")]
     if not bsdfs:
-        return "diffuse", None
+        # Mitsuba's own choice: grey, or black for a light.
+        lit = any(is_kind(child, "Emitter") for _, child in parsed.children(shape))
+        return "none" if lit else "diffuse", None
     node, twosided = bsdfs[0], False
     plugin = node.props.plugin_name()
     if plugin == "twosided":

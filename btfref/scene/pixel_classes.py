@@ -8,8 +8,10 @@ import numpy as np
 
 from btfref.conventions import PixelClass
 from btfref.scene.camera import film_rays, grid_offsets
-from btfref.scene.lights import is_delta
+from btfref.scene.emitters.lights import is_delta
 from btfref.scene.loading import loaded
+from btfref.scene.reading.instances import every_shape
+from btfref.scene.surfaces.materials import is_exact
 from btfref.types import JitArray, SceneLike
 
 #: A step between neighbouring samples that leaves the tangent plane by more than this share of a pixel's
@@ -49,6 +51,10 @@ EDGE = 1e-3
 #: Turn of the shading frame, in radians, below which the neighbouring triangle shows the same value.
 TURN = 1e-4
 
+#: Turn of the frame of one sphere, disk or cylinder between such rays that is none of its curvature: at a pole, or the
+#: centre of a disk, tangents take every direction.
+POLE = 1e-3
+
 
 def pixel_classes(
     scene: SceneLike,
@@ -64,12 +70,14 @@ def pixel_classes(
     A sample *may be seen otherwise* by another renderer where rays half a step of 1/256 pixel beside it, by which
     rasterizers snap vertices, hit something else: nothing, another shape, a surface at another depth, or the other side
     of the shading normal, at whose horizon B jumps to zero; and where rays within float32 rounding hit a triangle with
-    another frame or other texture coordinates, since ∂p/∂u is constant on a triangle and B jumps there. A pixel with
-    such a sample is *silhouette*. An *edge* pixel has none, but its samples or those of its eight neighbours meet an
-    edge: they mix hit and miss or several shapes, the surface jumps in depth between two of them (a fold in front of
-    the cloth itself), or turns away from the view. *Mesostructure* are other pixels in which a material with a
-    geometry of its own (a g-BRDF) jumps within `HIT` of a sample, under one of the scene's delta lights. All other
-    pixels that are hit are *interior*.
+    another frame or other texture coordinates, since ∂p/∂u is constant on a triangle and B jumps there, or the pole or
+    the seam of a sphere, disk or cylinder. A pixel with such a sample is *silhouette*. An *edge* pixel has none, but
+    its samples or those of its eight neighbours meet an edge: they mix hit and miss or several shapes, the surface
+    jumps in depth between two of them (a fold in front of the cloth itself), or turns away from the view.
+    *Mesostructure* are other pixels in which a material with a geometry of its own (a g-BRDF) jumps within `HIT` of a
+    sample, under one of the scene's delta lights. All other pixels that are hit are *interior*. *Other* is every pixel
+    with a sample that sees a material of which real time shows the mean albedo
+    (:mod:`btfref.scene.surfaces.materials`).
 
     Parameters
     ----------
@@ -95,6 +103,7 @@ def pixel_classes(
             made, grid, ROUNDING if follows_rays else np.inf
         )
         jumps = _displaced_edges(made, grid)
+        other = _other_materials(made, grid)
     hit = shape > 0
     edge = np.zeros(shape.shape, bool)
     for axis in (0, 1):
@@ -112,7 +121,32 @@ def pixel_classes(
     seen = np.where(any_hit, np.where(any_edge, PixelClass.EDGE, PixelClass.INTERIOR), PixelClass.BACKGROUND)
     seen = np.where(jumps & any_hit, PixelClass.MESOSTRUCTURE, seen)
     seen = np.where(np.any(ambiguous.reshape(pixels), axis=(1, 3)), PixelClass.SILHOUETTE, seen)
-    return seen.astype(np.uint8)
+    return np.where(other, PixelClass.OTHER, seen).astype(np.uint8)
+
+
+def _other_materials(scene: JitArray, grid: int) -> np.ndarray | bool:
+    """Pixels with a sample that sees a material that real time shows otherwise, bool (H, W), or False without any."""
+    import drjit as dr
+    import mitsuba as mi
+
+    others = [bsdf for bsdf in {id(b): b for b in _materials(scene)}.values() if not is_exact(bsdf)]
+    if not others:
+        return False
+    sensor = scene.sensors()[0]
+    width, height = (int(k) for k in sensor.film().crop_size())
+    found = np.zeros(width * height, bool)
+    for offset in grid_offsets(grid):
+        si = scene.ray_intersect(film_rays(sensor, offset)[0])
+        seen = dr.reinterpret_array(mi.UInt32, si.bsdf())
+        dr.eval(seen)
+        numbers = [int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]) for bsdf in others]
+        found |= np.array(si.is_valid()) & np.isin(np.array(seen), numbers)
+    return found.reshape(height, width)
+
+
+def _materials(scene: JitArray) -> list[JitArray]:
+    """Materials of all shapes."""
+    return [shape.bsdf() for shape in every_shape(scene)]
 
 
 def _displaced_edges(scene: JitArray, grid: int) -> np.ndarray | bool:
@@ -122,7 +156,7 @@ def _displaced_edges(scene: JitArray, grid: int) -> np.ndarray | bool:
 
     from mitsuba_plugins.protocol import is_displaced
 
-    if not any(is_displaced(shape.bsdf()) for shape in scene.shapes()):
+    if not any(is_displaced(shape.bsdf()) for shape in every_shape(scene)):
         return False
     lights = [light for light in scene.emitters() if is_delta(light)]
     sensor = scene.sensors()[0]
@@ -237,9 +271,12 @@ def _seen(scene: JitArray, offset: tuple[float | JitArray, float | JitArray]) ->
 
     ray, _ = film_rays(scene.sensors()[0], offset)
     si = scene.ray_intersect(ray)
+    # Two instances show one shape: it takes both numbers.
+    number = dr.reinterpret_array(mi.UInt32, si.shape) + (dr.reinterpret_array(mi.UInt32, si.instance) << 16)
     seen = {
-        "shape": dr.select(si.is_valid(), dr.reinterpret_array(mi.UInt32, si.shape), 0),
+        "shape": dr.select(si.is_valid(), number, 0),
         "triangle": si.prim_index,
+        "mesh": si.is_valid() & si.shape.is_mesh(),
         "distance": si.t,
         "point": si.p,
         "normal": si.n,
@@ -265,10 +302,12 @@ def _seen_otherwise(one: dict[str, JitArray], other: dict[str, JitArray], footpr
 
 
 def _in_another_frame(one: dict[str, JitArray], other: dict[str, JitArray]) -> JitArray:
-    """Whether a ray beside hits a triangle whose shading frame or texture coordinates are not the continued ones."""
+    """Whether a ray beside hits a place whose shading frame or texture coordinates are not the continued ones."""
     import drjit as dr
 
     turn = dr.norm(other["tangent"] - one["tangent"]) + dr.norm(other["shading"] - one["shading"])
     jump = dr.max(dr.abs(other["uv"] - one["uv"])) > SEAM
     both = (one["shape"] > 0) & (other["shape"] > 0)
-    return both & (one["triangle"] != other["triangle"]) & ((turn > TURN) | jump)
+    # Triangles that meet, or a pole and the seam of a shape that is one piece.
+    apart = one["mesh"] & (one["triangle"] != other["triangle"]) & ((turn > TURN) | jump)
+    return both & (apart | (~one["mesh"] & ((turn > POLE) | jump)))

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.sphere.frames import Turn, nearest_turn
+from btfref.scene.reading.instances import Where
+from btfref.scene.surfaces.materials import PlainMaterial
+from btfref.scene.surfaces.quadrics import KINDS, Quadric
 from btfref.types import JitArray, PathLike
 
 #: Segments of a full turn of a tessellated sphere, disk or cylinder: chords lie within 4e-5 radii of the
@@ -51,6 +56,9 @@ class BtfMaterial:
     lod_bias: float = 0.0
     lod_unit: float = 1.0
 
+    #: Real time shows it as it is.
+    exact: ClassVar[bool] = True
+
     @property
     def turn(self) -> Turn:
         """What takes local directions to the frame of the transformed texture."""
@@ -80,7 +88,15 @@ class MeshDescription:
     bsdf : str
         Plugin of the BSDF, for messages.
     to_world : ndarray, shape (4, 4)
-        The shape's own transform, as written in the scene (the positions have it already).
+        The shape's own transform, as written in the scene, and its instance's (the positions have it already).
+    where : btfref.scene.reading.instances.Where
+        Which of Mitsuba's shapes it is.
+    emission : ndarray, shape (3,)
+        Radiance of its own light on the side of its shading normal, in W/(m² sr).
+    quadric : btfref.scene.surfaces.quadrics.Quadric or None
+        Of a sphere, disk or cylinder, whose triangles are an approximation.
+    plain : btfref.scene.surfaces.materials.PlainMaterial or None
+        What is shown of a material that is no BTF.
     """
 
     name: str
@@ -93,6 +109,26 @@ class MeshDescription:
     material: BtfMaterial | None
     bsdf: str
     to_world: np.ndarray
+    where: Where = field(default_factory=lambda: Where(0))
+    emission: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    quadric: Quadric | None = None
+    plain: PlainMaterial | None = None
+
+    @property
+    def only_emits(self) -> bool:
+        """Whether it is a light without a material: Mitsuba then makes it black."""
+        return self.material is None and self.bsdf == "none" and bool(np.any(self.emission > 0))
+
+    @property
+    def shown(self) -> BtfMaterial | PlainMaterial:
+        """What is shown: the BTF, or what stands for another material.
+
+        Raises
+        ------
+        InputError
+            When it has neither.
+        """
+        return self.plain if self.material is None and self.plain is not None else self.btf
 
     @property
     def btf(self) -> BtfMaterial:
@@ -106,6 +142,12 @@ class MeshDescription:
         if self.material is None:
             raise InputError("a btf material is needed", field=self.name, got=self.bsdf)
         return self.material
+
+    @property
+    def twosided(self) -> bool:
+        """Whether its back is seen as its front is."""
+        material = self.material or self.plain
+        return material is not None and material.twosided
 
     def corners(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Per-triangle data for shading as Mitsuba 3.9 does it.
@@ -193,7 +235,16 @@ def _unit(v: np.ndarray) -> np.ndarray:
     return v / np.where(length > 0, length, 1.0)
 
 
-def triangles_of(shape: JitArray, node: JitArray, *, file: PathLike) -> dict[str, Any]:
+def triangles_of(
+    shape: JitArray,
+    node: JitArray,
+    *,
+    file: PathLike,
+    name: str,
+    outer: np.ndarray,
+    btf: bool = True,
+    bitmap: bool = False,
+) -> dict[str, Any]:
     """Vertices of a shape, read from the instantiated mesh or tessellated.
 
     Parameters
@@ -203,37 +254,56 @@ def triangles_of(shape: JitArray, node: JitArray, *, file: PathLike) -> dict[str
     node : mitsuba.parser.SceneNode
     file : str
         Scene and line, for messages.
+    name : str
+        Of the shape, likewise.
+    outer : ndarray, shape (4, 4)
+        Transform of the instance that shows the shape.
+    btf, bitmap : bool
+        Whether it shows a BTF, which needs texture coordinates of its own, or a bitmap.
 
     Returns
     -------
     dict
-        ``positions``, ``normals``, ``uv``, ``faces``, ``flip``, ``to_world`` of :class:`MeshDescription`.
+        ``positions``, ``normals``, ``uv``, ``faces``, ``flip``, ``to_world``, ``quadric`` of :class:`MeshDescription`.
 
     Raises
     ------
     InputError
-        For a shape without texture coordinates or of a kind that has no triangles here.
+        For a shape with a BTF and without texture coordinates, or of a kind that has no triangles here.
     """
     import mitsuba as mi
 
     props = node.props
-    plugin, name = props.plugin_name(), shape.id()
-    to_world = np.array(props["to_world"].matrix, float) if "to_world" in props else np.eye(4)
+    plugin = props.plugin_name()
+    to_world = outer @ (np.array(props["to_world"].matrix, float) if "to_world" in props else np.eye(4))
     common = {"to_world": to_world}
     if shape.is_mesh() and plugin not in _TESSELLATIONS:
-        if not shape.has_vertex_texcoords():
+        if not shape.has_vertex_texcoords() and btf:
             raise InputError("the shape has no texture coordinates", file=file, field=name, got=plugin)
+        if plugin == "obj" and (btf or bitmap):
+            refuse_partial_uv(props["filename"], scene=file, name=name)
         arrays = mi.traverse(shape)
-        normals = None
+        normals, flip = None, bool(shape.has_flipped_normals())
+        positions = np.array(arrays["vertex_positions"]).reshape(-1, 3)
         if shape.has_vertex_normals():
             normals = np.array(arrays["vertex_normals"]).reshape(-1, 3)
-        return common | {
-            "positions": np.array(arrays["vertex_positions"]).reshape(-1, 3),
-            "normals": normals,
-            "uv": np.array(arrays["vertex_texcoords"]).reshape(-1, 2),
-            "faces": np.array(arrays["faces"]).reshape(-1, 3).astype(np.int64),
-            "flip": bool(shape.has_flipped_normals()),
-        }
+        if not np.array_equal(outer, np.eye(4)):
+            positions = positions @ outer[:3, :3].T + outer[:3, 3]
+            if normals is None:
+                # A mirror turns the order of corners round, and Mitsuba's normals of instances not.
+                flip ^= bool(np.linalg.det(outer[:3, :3]) < 0)
+            else:
+                normals = _unit(normals @ np.linalg.inv(outer[:3, :3]))
+        faces = np.array(arrays["faces"]).reshape(-1, 3).astype(np.int64)
+        if shape.has_vertex_texcoords():
+            uv = np.array(arrays["vertex_texcoords"]).reshape(-1, 2)
+        else:
+            # Mitsuba's own: barycentric coordinates, in each triangle anew.
+            uv = np.tile([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], (len(faces), 1))
+            positions = positions[faces].reshape(-1, 3)
+            normals = None if normals is None else normals[faces].reshape(-1, 3)
+            faces = np.arange(len(uv)).reshape(-1, 3)
+        return common | {"positions": positions, "normals": normals, "uv": uv, "faces": faces, "flip": flip}
     if plugin not in _TESSELLATIONS:
         known = ", ".join(["meshes", *_TESSELLATIONS])
         raise InputError(
@@ -245,13 +315,54 @@ def triangles_of(shape: JitArray, node: JitArray, *, file: PathLike) -> dict[str
     normals = _unit(normals @ np.linalg.inv(matrix[:3, :3]))
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = faces[:, ::-1]
+    flip = "flip_normals" in props and bool(props["flip_normals"])
+    own = np.linalg.solve(outer, matrix)
+    quadric = Quadric.of(plugin, own, flip).moved(outer) if plugin in KINDS else None
     return common | {
         "positions": positions @ matrix[:3, :3].T + matrix[:3, 3],
         "normals": normals,
         "uv": uv,
         "faces": faces,
-        "flip": "flip_normals" in props and bool(props["flip_normals"]),
+        "flip": quadric.flip if quadric else flip,
+        "quadric": quadric,
     }
+
+
+#: Faces of an OBJ file, one with texture coordinates, and a corner without.
+_FACE = re.compile(rb"^[ \t]*f[ \t][^\r\n#]*", re.MULTILINE)
+_UV_CORNER = re.compile(rb"^[ \t]*f[ \t][^\r\n#]*?\d/-?\d", re.MULTILINE)
+_BARE_CORNER = re.compile(rb"[ \t]-?\d+(?://-?\d+|/{0,2})(?=\s|$)")
+
+
+def refuse_partial_uv(file: PathLike, *, scene: PathLike, name: str) -> None:
+    """Refuse a Wavefront OBJ some of whose faces have texture coordinates, and others not: Mitsuba makes them up.
+
+    Parameters
+    ----------
+    file : path-like
+        The OBJ.
+    scene : str
+        Scene and line, for the message.
+    name : str
+        Of the shape.
+
+    Raises
+    ------
+    InputError
+    """
+    if not Path(file).is_file():
+        return  # Mitsuba says so
+    data = Path(file).read_bytes()
+    if not _UV_CORNER.search(data):
+        return  # no face has them: not for this message
+    if found := next((face for face in _FACE.finditer(data) if _BARE_CORNER.search(face[0])), None):
+        line = data.count(b"\n", 0, found.start()) + 1
+        raise InputError(
+            f"{Path(file).name}, line {line}: a face without texture coordinates among faces that have them",
+            file=scene,
+            field=name,
+            expected="texture coordinates (vt) at every corner of every face",
+        )
 
 
 def _grid(n_u: int, n_v: int) -> tuple[np.ndarray, np.ndarray]:
@@ -305,9 +416,6 @@ def _disk(props: JitArray) -> Tessellation:
 
 def _cylinder(props: JitArray) -> Tessellation:
     # u = azimuth / 2π, v along the axis: cylinder.cpp of Mitsuba 3.9.
-    from mitsuba import ScalarTransform4f as Transform
-    from mitsuba import coordinate_system as mitsuba_coordinate_system
-
     uv, faces = _grid(SEGMENTS, 1)
     phi = 2 * np.pi * uv[:, 0]
     normals = np.stack([np.cos(phi), np.sin(phi), np.zeros(len(uv))], -1)
@@ -316,9 +424,9 @@ def _cylinder(props: JitArray) -> Tessellation:
     radius = float(props["radius"]) if "radius" in props else 1.0
     axis = p1 - p0
     length = np.linalg.norm(axis)
-    s, t = (np.array(v, float) for v in mitsuba_coordinate_system((axis / length).tolist()))
-    local = np.array(Transform().translate(p0.tolist()).matrix, float)
-    local[:3, :3] = np.stack([radius * s, radius * t, axis], -1)
+    s = coordinate_system(axis / length)
+    local = np.eye(4)
+    local[:3] = np.stack([radius * s, radius * np.cross(axis / length, s), axis, p0], -1)
     return np.concatenate([normals[:, :2], uv[:, 1:]], -1), normals, uv, faces, local
 
 

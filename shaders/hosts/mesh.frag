@@ -1,9 +1,11 @@
-// Provides the radiance towards the camera under directional and point lights and an environment, without cast shadows.
+// Provides the radiance towards the camera under the scene's lights and an environment, without cast shadows.
 // Expects a representation, the tables of hosts/mesh.vert, the camera's rays, the lights and the material.
 
+#include "lib/surface/film.glsl"
 #include "lib/surface/frame.glsl"
 #include "lib/light/lights.glsl"
 #include "lib/surface/lod.glsl"
+#include "lib/surface/quadric.glsl"
 #include "lib/surface/triangle_table.glsl"
 #include "representation"
 #include "environment"
@@ -13,19 +15,21 @@ uniform vec3 camera_origin;
 uniform vec3 ray_corner;    // towards film coordinate (0, 0), the top left corner
 uniform vec3 ray_right;     // change per pixel to the right
 uniform vec3 ray_down;      // change per pixel downwards
-uniform vec2 film_offset;   // from gl_FragCoord.x and height - gl_FragCoord.y to the film coordinate of the sample
-uniform float film_height;
 uniform vec3 uv_row0;       // texture transform: u' = dot(uv_row0, (u, v, 1))
 uniform vec3 uv_row1;
 uniform vec3 uv_turn;       // of the local frame by the texture transform: cosine, sine, -1 where it mirrors
 uniform float scale;
 uniform bool two_sided;
+uniform vec3 emission;      // radiance of the shape's own light
 uniform int pass;           // number of this picture among those that add up
+#ifdef HAS_ENVIRONMENT
+uniform int environment_passes;  // that the environment takes part in
+#endif
 
 #ifdef SEEN
 uniform highp sampler2D seen;  // what each pixel sees, from hosts/seen.frag
 uniform int mesh;              // that is drawn
-#else
+#elif !defined(QUADRIC)
 flat in int triangle;
 #endif
 
@@ -41,9 +45,20 @@ void main() {
         return;
     }
 #endif
-    vec2 film = vec2(gl_FragCoord.x, film_height - gl_FragCoord.y) + film_offset;
+    vec2 film = film_coordinate(gl_FragCoord);
     vec3 direction = normalize(ray_corner + film.x * ray_right + film.y * ray_down);
+#ifdef QUADRIC
+    SurfacePoint point;
+    float window;
+    if (!quadric_intersect(film, point, window)) {
+        discard;
+    }
+#ifndef SEEN
+    gl_FragDepth = window;
+#endif
+#else
     SurfacePoint point = scene_intersect(triangles, triangle, camera_origin, direction);
+#endif
     mat3 to_local = frame_turned(shading_frame(point.normal, point.dp_du, point.side), uv_turn);
     vec3 uv1 = vec3(point.uv, 1.0);
     vec2 uv = vec2(dot(uv_row0, uv1), dot(uv_row1, uv1));
@@ -56,13 +71,9 @@ void main() {
     fetches = 0;  // of the geometry
 #endif
     vec3 sum = vec3(0.0);
-#ifdef HAS_BINS
-    bool lit = bin < 0;  // Clusters' bins overlap: one of its own has every triangle once.
-#else
-    bool lit = pass == 0;  // Passes add up: the first one has them.
-#endif
+    // Passes add up: light is the sum of what each of them has.
 #if N_LIGHTS > 0
-    for (int i = 0; i < (lit ? N_LIGHTS : 0); ++i) {
+    for (int i = light_first; i < light_end; ++i) {
         vec3 towards;
         vec3 irradiance = light_incident(i, point.position, towards);
         vec3 w_light = to_local * towards;
@@ -78,20 +89,25 @@ void main() {
     transfer_side = side < 0.0 ? 1 : 0;
     transfer_triangle = point.triangle;
     transfer_barycentric = point.barycentric;
-    if (!lit) {
+    if (bin >= 0) {  // Clusters' bins overlap: one of its own, without the environment, has every triangle once.
         sum += btf_environment(uv, w_view, to_world, lod);
     }
 #else
-    sum += btf_environment(uv, w_view, to_world, lod);
+    if (pass < environment_passes) {
+        sum += btf_environment(uv, w_view, to_world, lod);
+    }
 #endif
 #endif
+    // Mitsuba's area light shines on the side of the shading normal.
+    vec3 own_light = pass == 0 && dot(point.normal, direction) < 0.0 ? emission : vec3(0.0);
 #ifdef COUNT_FETCHES
     // Instead of coverage: the texels that the representation fetched.
     radiance = vec4(scale * sum, float(fetches));
 #elif defined(HAS_BINS)
     // Coverage comes from the pass that drew the depth: bins add up.
-    radiance = vec4(scale * sum, 0.0);
+    radiance = vec4(scale * sum + own_light, 0.0);
 #else
     radiance = vec4(scale * sum, 1.0);
+    radiance.rgb += own_light;
 #endif
 }

@@ -74,6 +74,9 @@ STAGES = [
     ("hosts/screen.vert", "hosts/depth.frag"),
 ]
 
+#: The same on spheres, disks and cylinders.
+ON_QUADRICS = [("hosts/quadric.vert", f"hosts/{name}.frag") for name in ("mesh", "seen", "depth")]
+
 
 @pytest.mark.parametrize("target", composer.TARGETS)
 @pytest.mark.parametrize("kind", ["ubo81", "scattered"])
@@ -84,11 +87,12 @@ def test_glslang_accepts_every_representation_in_every_host(need, fits, tmp_path
     shader, directories = device.shader_file(rep)
     for filter_type in ("bilinear", "nearest"):
         defines = {**device.shader_defines(rep, filter_type=filter_type), "N_LIGHTS": 3}
-        for pair in STAGES:
+        for pair in [*STAGES, *ON_QUADRICS]:
+            more = {"QUADRIC": 1} if pair in ON_QUADRICS else {}
             files, sources = [], []
             for name in pair:
                 source = composer.compose(
-                    name, defines, representation=shader, directories=directories, target=target
+                    name, defines | more, representation=shader, directories=directories, target=target
                 )
                 path = tmp_path / name.replace("/", "_")
                 path.write_text(source, encoding="utf-8")

@@ -226,8 +226,8 @@ def test_realtime_refuses_what_it_cannot_show(llvm):
         realtime(room(llvm, shapes=sphere, lights=LIGHTS))
     with pytest.raises(InputError, match="grid"):
         realtime(room(llvm, shapes={}, lights=LIGHTS), grid=0)
-    lamp = {"a": {"type": "sphere", "emitter": {"type": "area"}}}
-    with pytest.raises(InputError, match="delta lights or an environment"):
+    lamp = {"a": {"type": "sphere", "emitter": {"type": "directionalarea"}}}
+    with pytest.raises(InputError, match="directional or area"):
         render(room(llvm, shapes=lamp, lights=LIGHTS), grid=1)
     bare = room(llvm, shapes=sphere, lights=LIGHTS)
     del bare["integrator"]

@@ -17,6 +17,7 @@ from btfref.errors import BtfrefError
 if TYPE_CHECKING:
     from btfref.gates import GateResult
     from btfref.representations.protocol import Representation
+    from btfref.types import Facts
 
 
 #: Characters that a terminal obeys instead of showing: controls but for the line's end and the tab, marks that turn
@@ -51,6 +52,13 @@ def emit_json(data: object) -> None:
     text = json.dumps(data, indent=2, ensure_ascii=not utf8, default=_plain)
     # Controls that JSON leaves as they are stand in strings alone.
     emit(_CONTROLS.sub(lambda found: f"\\u{ord(found[0]):04x}" if found[0] != "\r" else found[0], text))
+
+
+def say_area_lights(meta: Facts) -> None:
+    """Write how many points stand for the area lights of a picture, if any, from its ``meta``."""
+    if "area_light_points" in meta:
+        points, error = meta["area_light_points"], meta["area_light_error"]
+        emit(f"area lights: {points} points, estimated error {100 * error:.2g} %")
 
 
 def _plain(value: Any) -> object:

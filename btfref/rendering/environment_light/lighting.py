@@ -125,6 +125,13 @@ class Lighting:
         return self.path == "transfer"
 
     @cached_property
+    def of_plain(self) -> Lighting:
+        """The way that the environment lights materials that are no BTFs: by its lights, whatever the others' is."""
+        if self.path in ("auto", "lights"):
+            return self
+        return Lighting(self.environment, "lights")
+
+    @cached_property
     def _vertex_transfer(self) -> list[np.ndarray] | None:
         """Of all meshes, or None where nothing hides the environment."""
         settings = self._transfer
@@ -137,6 +144,8 @@ class Lighting:
         """Mean colour of a material under radiance 1, over texels and views, shape (3,)."""
         from btfref import representations
 
+        if mesh.plain is not None:
+            return mesh.plain.albedo
         rep = representations.load(mesh.btf.filename)
         rng = np.random.default_rng(0)
         uv, w_view = rng.random((ALBEDO_SAMPLES, 2)), rng.normal(size=(ALBEDO_SAMPLES, 3))

@@ -201,7 +201,7 @@ def vertex_transfer(
     for bounce in range(bounces):
         for i, mesh in enumerate(meshes):
             for side in (0, 1):
-                two = side == 0 or (mesh.material is not None and mesh.material.twosided)
+                two = side == 0 or mesh.twosided
                 scale = np.asarray(albedo[i], float) / np.pi * two
                 found = np.einsum("vi,vcij->cvj", lobe[i][side], total[i])
                 sent[:, starts[i] : starts[i + 1], side] = scale[:, None, None] * found

@@ -17,6 +17,7 @@ import numpy as np
 from btfref.errors import BtfrefError, InputError, MissingDependencyError
 from btfref.rendering.gl import composer
 from btfref.representations.lookup import packed_arrays
+from btfref.scene.surfaces.materials import PlainMaterial
 from btfref.types import JitArray, PathLike
 
 if TYPE_CHECKING:
@@ -220,6 +221,8 @@ def shader_file(rep: Representation) -> tuple[str, list[Path]]:
 
     from btfref.registry import method
 
+    if isinstance(rep, PlainMaterial):
+        return rep.SHADER, []
     row = method(rep.meta["method"])
     return row.shader, [Path(str(files(row.shader_package)))] if row.shader_package else []
 

@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from btfref.errors import InputError
+from btfref.rendering.environment_light.lighting import PASS
+from btfref.scene.emitters.lights import KINDS
 from btfref.scene.shapes import neighbours
 
 if TYPE_CHECKING:
+    from btfref.rendering.environment_light.prepared import Prepared
     from btfref.scene.description import Camera, Light
     from btfref.scene.shapes import BtfMaterial, MeshDescription
+    from btfref.scene.surfaces.materials import PlainMaterial
+    from btfref.types import Facts
 
 
-def material_uniforms(material: BtfMaterial, texels: tuple[int, int], angle: float) -> dict[str, Any]:
+def material_uniforms(
+    material: BtfMaterial | PlainMaterial, texels: tuple[int, int], angle: float
+) -> dict[str, Any]:
     """What ``shaders/hosts/mesh.frag`` and ``shaders/lib/surface/lod.glsl`` read of a material.
 
     Parameters
     ----------
-    material : BtfMaterial
+    material : BtfMaterial or PlainMaterial
     texels : (int, int)
         Rows and columns of level 0.
     angle : float
@@ -106,7 +114,50 @@ def clip_planes(camera: Camera, meshes: Sequence[MeshDescription]) -> tuple[floa
     return near, max(min(camera.far, 1.01 * high), 1.01 * near)
 
 
-def light_uniforms(lights: Sequence[Light]) -> dict[str, np.ndarray]:
-    """What ``shaders/lib/light/lights.glsl`` reads of directional and point lights."""
-    position = [[*light.position, 0.0 if light.kind == "directional" else 1.0] for light in lights]
-    return {"light_position": np.array(position), "light_power": np.array([light.power for light in lights])}
+def light_table(lights: Sequence[Light]) -> np.ndarray:
+    """What ``shaders/lib/light/lights.glsl`` reads of lights.
+
+    Parameters
+    ----------
+    lights : sequence of Light
+
+    Returns
+    -------
+    ndarray of float32, shape (n ≥ 1, 3, 4)
+    """
+    table = np.zeros((max(len(lights), 1), 3, 4), np.float32)
+    for row, light in zip(table, lights, strict=False):
+        row[0, :3], row[0, 3] = light.position, KINDS.index(light.kind)
+        row[1, :3], row[1, 3] = light.power, light.cutoff
+        row[2, :3], row[2, 3] = light.axis, 1 / max(light.cutoff - light.beam_width, 1e-6)
+    return table
+
+
+def light_passes(light: Prepared | None, n_lights: int, n_faces: int) -> list[tuple[Facts, int]]:
+    """Pictures of a mesh that add up: uniforms, and the number of triangles.
+
+    Parameters
+    ----------
+    light : btfref.rendering.environment_light.prepared.Prepared or None
+        How an environment lights the mesh.
+    n_lights : int
+        Others.
+    n_faces : int
+        Of the mesh.
+    """
+    parts = [(first, min(first + PASS, n_lights)) for first in range(0, n_lights, PASS)]
+    ranges = [{"light_first": first, "light_end": end} for first, end in parts]
+    nothing = {"light_first": 0, "light_end": 0}
+    if light is None:
+        return [(one, n_faces) for one in ranges or [nothing]]
+    if light.bins is None:
+        own = light.passes
+        # What the last pass of the environment had stays set, and is not read.
+        joined = zip_longest(own, ranges)
+        counted = {"environment_passes": len(own)}
+        return [({**(one or {}), **(other or nothing), **counted}, n_faces) for one, other in joined]
+    found = []
+    for values, count in zip(light.passes, np.diff(light.bins).tolist(), strict=True):
+        # Clusters' bins overlap: the one of number -1 has every triangle once.
+        found += [({**values, **one}, count) for one in (ranges if values["bin"] < 0 else [nothing])]
+    return found

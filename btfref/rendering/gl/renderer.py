@@ -9,7 +9,7 @@ samples a pixel, box filter. Each sample is one frame with a shifted projection;
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,10 +18,11 @@ from btfref import representations
 from btfref.errors import GRID, BtfrefError, InputError, refuse_above
 from btfref.rendering import RenderResult
 from btfref.rendering.environment_light.lighting import lighting_of
-from btfref.rendering.gl import device
+from btfref.rendering.gl import device, quadrics
 from btfref.rendering.gl.raster import (
     clip_planes,
-    light_uniforms,
+    light_passes,
+    light_table,
     material_uniforms,
     triangle_table,
     world_to_clip,
@@ -29,6 +30,7 @@ from btfref.rendering.gl.raster import (
 from btfref.scene.demand import MARGIN, kept_maps, number_kept
 from btfref.scene.description import SceneDescription, read_scene
 from btfref.scene.mirrored import mirrored_meshes
+from btfref.scene.surfaces.materials import PlainMaterial
 from btfref.types import Facts, JitArray, SceneLike
 
 if TYPE_CHECKING:
@@ -45,8 +47,8 @@ if TYPE_CHECKING:
 #: Gives the representation of a file.
 LoadFile = Callable[[str], "Representation"]
 
-#: Of what is shown: file, texel filter, and the mesh where each has light of its own.
-Key = tuple[str, str | None, int | None]
+#: Of what is shown: file or material, texel filter, the mesh where each has light of its own, whether on a quadric.
+Key = tuple["str | PlainMaterial", str | None, int | None, bool]
 
 
 def realtime(
@@ -94,18 +96,20 @@ def realtime(
     -------
     RenderResult
         A sample's footprint, and so the level of detail of methods that have levels, is that of 1/n of a pixel.
-        ``meta["mirrored"]`` names the shapes whose texture is mirrored; ``meta["frame_ms"]`` is the median time of one
-        frame (one sample a pixel), GPU timer and wall clock whichever is longer; ``gl_vendor``, ``gl_renderer``,
-        ``gl_version``; ``negative_fraction``, the share of channels below zero, and ``not_finite``, their number:
-        nothing is clamped; ``kept``, how many maps were kept by file. With an environment ``environment_path``, the way
+        ``meta["mirrored"]`` names the shapes whose texture is mirrored; ``other_materials`` those whose material is
+        drawn as its mean albedo, with its plugin (:mod:`btfref.scene.surfaces.materials`); ``frame_ms`` is the median
+        time of one frame (one sample a pixel), GPU timer and wall clock whichever is longer; ``gl_vendor``,
+        ``gl_renderer``, ``gl_version``; ``negative_fraction``, the share of channels below zero, and ``not_finite``,
+        their number: nothing is clamped; ``kept``, how many maps were kept by file. With an environment
+        ``environment_path``, the way
         taken, and what it says of itself, such as ``environment_lights`` and their ``estimated_error``; by file where
         there are several.
 
     Raises
     ------
     InputError
-        For a scene that cannot be read (see :func:`btfref.scene.description.read_scene`), without lights, with a shape
-        that has no BTF, or with a way to light by the environment that a method lacks.
+        For a scene that cannot be read (see :func:`btfref.scene.description.read_scene`), without lights, or with a way
+        to light by the environment that a method lacks.
     MissingDependencyError
         Without an OpenGL driver.
     """
@@ -146,6 +150,9 @@ def realtime(
             "environment": scene.environment.name if scene.environment else None,
             "kept": number_kept(needed),
             "mirrored": mirrored_meshes(scene.meshes),
+            "notes": list(scene.notes),
+            "other_materials": {mesh.name: mesh.bsdf for mesh in scene.meshes if not mesh.shown.exact},
+            **scene.facts,
             **renderer.environment_facts,
             **device.facts(renderer.ctx),
         }
@@ -184,7 +191,6 @@ class Renderer:
     ) -> None:
         if not scene.lights and scene.environment is None:
             raise InputError("the scene has no light", file=scene.source, field="emitter")
-        scene.demand_btfs("real-time rendering")
         self.ctx = device.context()
         self.camera = scene.camera
         self._owned: list[JitArray] = []
@@ -202,13 +208,14 @@ class Renderer:
         colour = self._own(self.ctx.texture(size, 4, dtype="f4"))
         self._target = self._own(self.ctx.framebuffer([colour], self._own(self.ctx.depth_renderbuffer(size))))
         self._near, self._far = clip_planes(self.camera, scene.meshes)
-        self._lights = light_uniforms(scene.lights) if scene.lights else {}
+        self._lights = self._own(device.upload(self.ctx, light_table(scene.lights), "scene_lights"))
         self._n_lights, self._lighting = len(scene.lights), lighting
         if lighting is None:
             self._lighting = lighting_of(scene)
         self._light_facts: Facts = {}
-        self._depth: tuple[JitArray, JitArray] | None = None
-        self._seen: tuple[JitArray, JitArray, JitArray, JitArray] | None = None
+        self._programs: dict[Hashable, tuple[JitArray, JitArray]] = {}
+        self._hosts: dict[tuple[str, bool], tuple[JitArray, JitArray]] = {}
+        self._seen: tuple[JitArray, JitArray] | None = None
         self._counting = {"COUNT_FETCHES": 1} if count_fetches else {}
         try:
             for number, mesh in enumerate(scene.meshes):
@@ -228,57 +235,90 @@ class Renderer:
         return thing
 
     def _add(self, number: int, mesh: MeshDescription, load_file: LoadFile) -> None:
-        material = mesh.btf
-        own = number if self._lighting is not None and self._lighting.per_mesh else None
-        key = (material.filename, material.filter_type, own)
+        material, lighting = mesh.shown, self._lighting
+        if lighting is not None and isinstance(material, PlainMaterial):
+            lighting = lighting.of_plain
+        own = number if lighting is not None and lighting.per_mesh else None
+        # Matrices of transfer belong to triangles.
+        exact = mesh.quadric is not None and own is None
+        what = material if isinstance(material, PlainMaterial) else material.filename
+        key = (what, material.filter_type, own, exact)
         if key not in self._shown:
-            rep = load_file(material.filename)
+            rep = what if isinstance(what, PlainMaterial) else load_file(what)
             light = None
-            if self._lighting is not None:
-                light = self._lighting.prepared(rep, file=material.filename, mesh=own)
-                self._light_facts[material.filename] = {"environment_path": light.path, **light.facts}
+            if lighting is not None:
+                file = what if isinstance(what, str) else None
+                light = lighting.prepared(rep, file=file, mesh=own)
+                if file:
+                    self._light_facts[file] = {"environment_path": light.path, **light.facts}
             shown = device.ShaderRepresentation.upload(
                 self.ctx, rep, filter_type=material.filter_type, light=light
             )
             defines = {"N_LIGHTS": self._n_lights, **self._counting}
-            by_pixel = light is not None and len(light.passes) > 1 and light.bins is None
+            by_pixel = len(light_passes(light, self._n_lights, 1)) > 1 and (
+                light is None or light.bins is None
+            )
             if by_pixel:
                 defines["SEEN"] = 1
                 self._what_is_seen()
-            vertex = "hosts/screen.vert" if by_pixel else "hosts/mesh.vert"
-            program = shown.program(self.ctx, vertex, "hosts/mesh.frag", defines=defines)
-            self._own(program), self._own(shown)
-            self._shown[key] = shown, program, self._own(self.ctx.vertex_array(program, [])), light
-        table = self._own(device.upload(self.ctx, triangle_table(mesh), "triangles"))
+            if exact:
+                defines["QUADRIC"] = 1
+            vertex = "quadric" if exact else "screen" if by_pixel else "mesh"
+            program, vertices = self._program(shown, f"hosts/{vertex}.vert", defines)
+            self._shown[key] = self._own(shown), program, vertices, light
+        table = None if exact else self._own(device.upload(self.ctx, triangle_table(mesh), "triangles"))
         self._meshes.append((mesh, key, table))
 
-    def _what_is_seen(self) -> tuple[JitArray, JitArray, JitArray, JitArray]:
+    def _program(
+        self, shown: device.ShaderRepresentation, vertex: str, defines: dict[str, Any]
+    ) -> tuple[JitArray, JitArray]:
+        """A program, and what it is drawn with; many materials are of one kind, and differ in what they read."""
+        constants = tuple(sorted({**shown.defines, **defines}.items()))
+        key = vertex, shown.shader, shown.environment, constants
+        if key not in self._programs:
+            made = self._own(shown.program(self.ctx, vertex, "hosts/mesh.frag", defines=defines))
+            self._programs[key] = made, self._own(self.ctx.vertex_array(made, []))
+        return self._programs[key]
+
+    def _what_is_seen(self) -> tuple[JitArray, JitArray]:
         """What each pixel sees: passes that add up shade pixels, not triangles of less than a pixel anew each time."""
         if self._seen is None:
             size = (self.camera.width, self.camera.height)
             texture = self._own(self.ctx.texture(size, 2, dtype="f4"))
             target = self._own(self.ctx.framebuffer([texture], self._own(self.ctx.depth_renderbuffer(size))))
-            program = self._own(device.compile_program(self.ctx, "hosts/mesh.vert", "hosts/seen.frag"))
-            self._seen = texture, target, program, self._own(self.ctx.vertex_array(program, []))
+            self._seen = texture, target
         return self._seen
 
     def _fill_seen(self, common: dict[str, Any]) -> None:
         """Find what each pixel sees, in all meshes."""
-        _, target, program, vertices = self._what_is_seen()
+        _, target = self._what_is_seen()
         target.use()
         target.clear(0.0, 0.0, 0.0, 0.0)
-        for number, (mesh, _, table) in enumerate(self._meshes):
-            device.bind(program, {"triangles": table})
-            device.set_uniforms(program, {**common, "mesh": number})
-            vertices.render(self.ctx.TRIANGLES, vertices=3 * len(mesh.faces))
+        self._draw_all("hosts/seen.frag", common)
         self._target.use()
 
-    def _depth_program(self) -> tuple[JitArray, JitArray]:
-        """Black surfaces: what fills the depth buffer before pictures are added up."""
-        if self._depth is None:
-            program = self._own(device.compile_program(self.ctx, "hosts/mesh.vert", "hosts/depth.frag"))
-            self._depth = program, self._own(self.ctx.vertex_array(program, []))
-        return self._depth
+    def _draw_all(self, fragment: str, common: dict[str, Any]) -> None:
+        """Draw all surfaces by a host that knows no material."""
+        for number, (mesh, _, table) in enumerate(self._meshes):
+            exact = table is None
+            if (fragment, exact) not in self._hosts:
+                vertex, defines = ("quadric", {"QUADRIC": 1}) if exact else ("mesh", {})
+                made = device.compile_program(self.ctx, f"hosts/{vertex}.vert", fragment, defines=defines)
+                self._hosts[fragment, exact] = self._own(made), self._own(self.ctx.vertex_array(made, []))
+            program, vertices = self._hosts[fragment, exact]
+            device.bind(program, {} if exact else {"triangles": table})
+            device.set_uniforms(program, {**common, **self._surface(mesh, table, common), "mesh": number})
+            count = quadrics.TRIANGLES if exact else len(mesh.faces)
+            vertices.render(self.ctx.TRIANGLES, vertices=3 * count)
+
+    def _surface(
+        self, mesh: MeshDescription, table: JitArray | None, common: dict[str, Any], *, adds: bool = False
+    ) -> dict[str, Any]:
+        """Uniforms of a shape that has no table of triangles."""
+        if table is not None or mesh.quadric is None:
+            return {}
+        clip, planes = common["world_to_clip"].T, (self._near, self._far)
+        return quadrics.quadric_uniforms(mesh.quadric, self.camera, clip, planes, adds=adds)
 
     def draw(self, offset: tuple[float, float] = (0.5, 0.5), *, share: float = 1.0) -> float:
         """Draw a frame.
@@ -310,33 +350,36 @@ class Renderer:
             # gl_FragCoord is at pixel centres.
             "film_offset": np.asarray(offset, float) - 0.5,
             "film_height": float(camera.height),
-            **self._lights,
         }
         ctx.finish()
         start = time.perf_counter()
         query = ctx.query(time=True)
         with query:
-            if any(light is not None and len(light.passes) > 1 for *_, light in self._shown.values()):
+            adds = any(len(light_passes(light, self._n_lights, 1)) > 1 for *_, light in self._shown.values())
+            if adds:
                 if self._seen is not None:
                     self._fill_seen(common)
                 self._fill_depth(common)
             for index, (mesh, key, table) in enumerate(self._meshes):
                 shown, program, vertices, light = self._shown[key]
-                tables, by_pixel = {**shown.textures, "triangles": table}, "seen" in program
+                tables, by_pixel = dict(shown.textures), "seen" in program
+                if table is not None:
+                    tables["triangles"] = table
+                tables["scene_lights"] = self._lights
                 if by_pixel:
                     tables["seen"] = self._what_is_seen()[0]
                     ctx.depth_func, self._target.depth_mask = ">", False
                 device.bind(program, tables)
-                own = material_uniforms(mesh.btf, shown.texels, share * camera.pixel_angle)
+                own = material_uniforms(mesh.shown, shown.texels, share * camera.pixel_angle)
+                own |= self._surface(mesh, table, common, adds=adds) | {"emission": mesh.emission}
                 device.set_uniforms(program, {**common, **own, "mesh": index})
-                passes: Sequence[Facts] = ({},) if light is None else light.passes
-                counts = [len(mesh.faces)] * len(passes)
                 if light is not None and light.bins is not None and light.transfer is not None:
-                    counts = np.diff(light.bins).tolist()
                     device.set_uniforms(program, {"transfer_components": light.transfer.table.shape[3]})
-                for number, (values, count) in enumerate(zip(passes, counts, strict=True)):
+                whole = quadrics.TRIANGLES if table is None else 1 if by_pixel else len(mesh.faces)
+                passes = light_passes(light, self._n_lights, whole)
+                for number, (values, count) in enumerate(passes):
                     device.set_uniforms(program, {**values, "pass": number})
-                    vertices.render(ctx.TRIANGLES, vertices=3 if by_pixel else 3 * count)
+                    vertices.render(ctx.TRIANGLES, vertices=3 * count)
                 if by_pixel:
                     ctx.depth_func, self._target.depth_mask = "<=", True
         ctx.depth_func = "<"
@@ -360,11 +403,7 @@ class Renderer:
     def _fill_depth(self, common: dict[str, Any]) -> None:
         """Draw all surfaces black; what follows adds to what is nearest."""
         ctx = self.ctx
-        program, vertices = self._depth_program()
-        for mesh, _, table in self._meshes:
-            device.bind(program, {"triangles": table})
-            device.set_uniforms(program, common)
-            vertices.render(ctx.TRIANGLES, vertices=3 * len(mesh.faces))
+        self._draw_all("hosts/depth.frag", common)
         ctx.depth_func = "<="
         ctx.enable(ctx.BLEND)
         ctx.blend_func = ctx.ONE, ctx.ONE

@@ -21,6 +21,7 @@ from btfref.representations.protocol import HasLevels
 from btfref.scene.description import read_scene
 from btfref.scene.hits import Hits, surfaces
 from btfref.scene.loading import loaded
+from btfref.scene.reading.instances import drawn_shapes
 from btfref.types import SceneLike
 
 if TYPE_CHECKING:
@@ -78,16 +79,25 @@ def approximate(
     description = read_scene(scene, parameters, size=size)
     if not description.lights and description.environment is None:
         raise InputError("the scene has no light", file=description.source, field="emitter")
-    description.demand_btfs("the approximation")
     lighting = lighting_of(description, path, **options)
     start, camera = time.perf_counter(), description.camera
     reps, prepared, total = {}, {}, np.zeros((camera.height * camera.width, 3))
     wanted = np.full(len(total), True) if pixels is None else np.ravel(pixels)
     with loaded(scene, parameters, size=size, sampled=False) as made:
+        shapes = drawn_shapes(made, [mesh.where for mesh in description.meshes])
         for surface in surfaces(made, grid):
-            for number, (mesh, shape) in enumerate(zip(description.meshes, made.shapes(), strict=True)):
-                hits = Hits.of(surface, mesh.btf, np.flatnonzero(surface.sees(shape) & wanted))
+            for number, (mesh, drawn) in enumerate(zip(description.meshes, shapes, strict=True)):
+                seen = surface.sees(drawn) & wanted
+                # Mitsuba's area light shines on the side of the shading normal.
+                total[seen & (surface["wi"][:, 2] > 0)] += mesh.emission
+                hits = Hits.of(surface, mesh.shown, np.flatnonzero(seen))
                 if not len(hits.at):
+                    continue
+                if mesh.material is None:
+                    rep, light = mesh.plain, None
+                    if lighting is not None:
+                        light = lighting.of_plain.prepared(rep)
+                    total[hits.at] += _radiance(rep, hits, mesh, description, grid, light)
                     continue
                 name = mesh.btf.filename
                 if name not in reps:
@@ -108,6 +118,7 @@ def approximate(
         "grid": grid,
         "shadows": False,
         "environment": description.environment.name if description.environment else None,
+        **description.facts,
         "seconds": time.perf_counter() - start,
     }
     if len(facts) == 1:
@@ -156,12 +167,7 @@ def _radiance(
 
     everywhere, total = np.arange(len(hits.at)), np.zeros((len(hits.at), 3))
     for light in description.lights:
-        towards, power = light.position - hits.position, light.power
-        if light.kind == "directional":
-            towards = np.broadcast_to(light.position, hits.position.shape)
-        else:
-            square = (towards**2).sum(1, keepdims=True)
-            towards, power = towards / np.sqrt(square), power / square
+        towards, power = light.incident(hits.position)
         w_light = np.einsum("ni,nij->nj", towards, hits.to_world)
         total += power * evaluate(hits.uv, w_light, hits.w_view, everywhere)
     if prepared is not None:

@@ -8,11 +8,15 @@ from btfref.errors import InputError
 from btfref.numerics.device_arrays import to_device
 from btfref.rendering import RenderResult
 from btfref.scene.camera import film_rays, grid_offsets
-from btfref.scene.lights import distant_or_delta, is_delta
+from btfref.scene.emitters.area_lights import AreaLights, area_lights
+from btfref.scene.emitters.lights import checked_emitters, is_area, is_delta
 from btfref.types import Facts, JitArray
 
 #: Camera rays times samples that are traced at a time.
 LANES = 1 << 22
+
+#: Radius of a lens that is a pinhole: Mitsuba takes the smallest float for 0.
+POINT = 1e-6
 
 #: Independent rounds a sub-pixel position: their spread is the variance.
 ROUNDS = 4
@@ -49,20 +53,33 @@ def on_grid(
     Raises
     ------
     InputError
-        For an area light, or a variant that is none of a JIT.
+        For a light that no surface meets, a lens with depth of field, or a variant that is none of a JIT.
     """
     import drjit as dr
     import mitsuba as mi
 
     if not dr.is_jit_v(mi.Float):
         raise InputError("a regular grid needs a JIT variant", field="variant", got=mi.variant())
+    _refuse_lens(scene)
     settings: Facts = {"grid": grid, "shadows": shadows}
-    if all(is_delta(emitter) for emitter in distant_or_delta(scene)) and not random:
-        settings["integrator"] = "noise-free direct"
-        return RenderResult(noise_free(scene, grid, shadows), None, settings)
+    if all(is_delta(emitter) or is_area(emitter) for emitter in checked_emitters(scene)) and not random:
+        areas = area_lights(scene, mi)
+        settings |= {"integrator": "noise-free direct", **areas.facts}
+        return RenderResult(noise_free(scene, grid, shadows, areas), None, settings)
     pictures, variance, spp = regular(scene, grid, spp, seed, shadows)
     settings |= {"spp": spp, "seed": seed, "integrator": "direct"}
     return RenderResult(pictures.mean(0), variance, settings, pictures)
+
+
+def _refuse_lens(scene: JitArray) -> None:
+    """Refuse a camera with depth of field: its rays would all start at the middle of the lens."""
+    import mitsuba as mi
+
+    values = mi.traverse(scene.sensors()[0])
+    if "aperture_radius" in values and (radius := float(np.max(values["aperture_radius"]))) > POINT:
+        raise InputError(
+            "a regular grid has no depth of field", field="aperture_radius", got=f"{radius:g}", expected=0
+        )
 
 
 def make_integrator(shadows: bool) -> JitArray:
@@ -130,9 +147,13 @@ def _direct(
     light, weight = scene.sample_emitter_direction(si, of_light, shadows, active)
     lit = active & (light.pdf > 0)
     value, pdf = bsdf.eval_pdf(context, si, si.to_local(light.d), lit)
-    share = dr.select(light.delta, 1, heuristic(light.pdf, pdf))
-    result = dr.select(lit, weight * value * share, 0)
     environment = scene.environment()
+    # The material proposes directions for the environment alone.
+    alone = (
+        light.delta if environment is None else light.delta | (light.emitter != mi.EmitterPtr(environment))
+    )
+    share = dr.select(alone, 1, heuristic(light.pdf, pdf))
+    result = emission(scene, si, active) + dr.select(lit, weight * value * share, 0)
     if environment is not None:
         sampled, weight = bsdf.sample(context, si, lobe, of_bsdf, active)
         going = active & (sampled.pdf > 0)
@@ -233,39 +254,76 @@ def regular(
     return pictures, variance.T.reshape(height, width, 3).astype(np.float32), rounds * step * grid**2
 
 
-def noise_free(scene: JitArray, n: int, shadows: bool) -> np.ndarray:
-    """Mean over the n × n grid of Σ over delta lights of incident power × ``bsdf.eval``; float32 (H, W, 3)."""
+def emission(scene: JitArray, si: JitArray, active: JitArray) -> JitArray:
+    """Radiance of the area lights that are seen themselves."""
+    import drjit as dr
+    import mitsuba as mi
+
+    light = si.emitter(scene, active)
+    return dr.select(active, light.eval(si, active & (light != mi.EmitterPtr(None))), 0)
+
+
+def noise_free(scene: JitArray, n: int, shadows: bool, areas: AreaLights) -> np.ndarray:
+    """Mean over the n × n grid of Σ over lights of incident power × ``bsdf.eval``; float32 (H, W, 3).
+
+    Lights are the scene's delta lights and the points that stand for its area lights.
+    """
     sensor = scene.sensors()[0]
     width, height = (int(k) for k in sensor.film().crop_size())
     total = np.zeros((3, width * height))
     for offset in grid_offsets(n):
         ray, weight = film_rays(sensor, offset)
-        total += np.array(weight * _exact(scene, ray, shadows), float)
+        total += np.array(weight * _exact(scene, ray, shadows, areas), float)
     return (total.T / n**2).reshape(height, width, 3).astype(np.float32)
 
 
-def _exact(scene: JitArray, ray: JitArray, shadows: bool) -> JitArray:
-    """Radiance along camera rays: Σ over delta lights of incident power × ``bsdf.eval``."""
+def _exact(scene: JitArray, ray: JitArray, shadows: bool, areas: AreaLights) -> JitArray:
+    """Radiance along camera rays: Σ over lights of incident power × ``bsdf.eval``, and of lights that are seen."""
     import drjit as dr
     import mitsuba as mi
 
     si = scene.ray_intersect(ray)
     bsdf = si.bsdf(ray)
-    context = mi.BSDFContext()
-    emitters = scene.emitters_dr()
+    context, valid = mi.BSDFContext(), si.is_valid()
 
-    def body(i: JitArray, sum_: JitArray) -> tuple[JitArray, JitArray]:
-        emitter = dr.gather(mi.EmitterPtr, emitters, i, si.is_valid())
-        sample, power = emitter.sample_direction(si, mi.Point2f(0.5), si.is_valid())
-        active = si.is_valid() & (sample.pdf > 0)
-        local = si.to_local(sample.d)
+    def reflected(towards: JitArray, place: JitArray, power: JitArray, active: JitArray) -> JitArray:
+        local = si.to_local(towards)
         # What only reflects is black under a light behind it: no shadow ray and no lookup.
         active &= (local.z * si.wi.z > 0) | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
         if shadows:
-            active &= ~scene.ray_test(si.spawn_ray_to(sample.p), active)
-        value = bsdf.eval(context, si, local, active)
-        return i + 1, sum_ + dr.select(active, power * value, 0)
+            active &= ~scene.ray_test(si.spawn_ray_to(place), active)
+        return dr.select(active, power * bsdf.eval(context, si, local, active), 0)
 
-    count = len(scene.emitters())
-    start = dr.zeros(mi.UInt32, dr.width(ray)), dr.zeros(mi.Spectrum, dr.width(ray))
-    return dr.while_loop(start, lambda i, _: i < count, body, labels=("light", "radiance"))[1]
+    emitters = scene.emitters_dr()
+    deltas = [k for k, light in enumerate(scene.emitters()) if not is_area(light)]
+    chosen = to_device(mi.UInt32, deltas) if deltas else None
+
+    def of_delta(i: JitArray, sum_: JitArray) -> tuple[JitArray, JitArray]:
+        emitter = dr.gather(mi.EmitterPtr, emitters, dr.gather(mi.UInt32, chosen, i, valid), valid)
+        sample, power = emitter.sample_direction(si, mi.Point2f(0.5), valid)
+        return i + 1, sum_ + reflected(sample.d, sample.p, power, valid & (sample.pdf > 0))
+
+    tables = [to_device(kind, a.T) for kind, a in _tables(areas)] if len(areas) else []
+
+    def of_point(i: JitArray, sum_: JitArray) -> tuple[JitArray, JitArray]:
+        place, normal, power = (dr.gather(type(table), table, i, valid) for table in tables)
+        offset = place - si.p
+        square = dr.squared_norm(offset)
+        towards = offset * dr.rsqrt(square)
+        facing = -dr.dot(towards, normal)
+        return i + 1, sum_ + reflected(towards, place, power * (facing / square), valid & (facing > 0))
+
+    sum_ = dr.select(valid, emission(scene, si, valid), dr.zeros(mi.Spectrum, dr.width(ray)))
+    for body, count in ((of_delta, len(deltas)), (of_point, len(areas))):
+        if count:
+            start, n = dr.zeros(mi.UInt32, dr.width(ray)), dr.opaque(mi.UInt32, count)
+            labels = ("light", "radiance")
+            sum_ = dr.while_loop((start, sum_), lambda i, _, n=n: i < n, body, labels=labels)[1]
+    return sum_
+
+
+def _tables(areas: AreaLights) -> list[tuple[type, np.ndarray]]:
+    """Position, normal and power of the points, and what each of them is on the device."""
+    import mitsuba as mi
+
+    return [(mi.Point3f, areas.position), (mi.Normal3f, areas.normal), (mi.Color3f, areas.power)]

@@ -17,11 +17,13 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.rendering import RenderResult
+from btfref.rendering.offline.direct_light import emission
 from btfref.scene.camera import film_rays
 from btfref.scene.description import read_scene
+from btfref.scene.emitters.lights import checked_emitters
 from btfref.scene.hits import Hits
-from btfref.scene.lights import distant_or_delta
 from btfref.scene.loading import loaded
+from btfref.scene.reading.instances import drawn_shapes
 from btfref.types import JitArray, SceneLike
 
 if TYPE_CHECKING:
@@ -52,7 +54,7 @@ def render_exact(
     max_depth: int | None = None,
     batches: int = BATCHES,
 ) -> RenderResult:
-    """Path trace the mesostructure at the hits of a scene with delta lights or an environment, without cast shadows.
+    """Path trace the mesostructure at the hits of a scene with lights of any kind, without cast shadows.
 
     Parameters
     ----------
@@ -98,10 +100,12 @@ def render_exact(
     with loaded(scene, parameters, size=size, sampled=False) as made:
         # Lights at any height: the largest patch that there is, and rays beyond it wrap.
         tiles = TiledScene(mesostructure, np.array([[1.0, 0.0, 1e-6]]))
+        drawn = drawn_shapes(made, [mesh.where for mesh in description.meshes])
+        lamps = [d.shape for d, mesh in zip(drawn, description.meshes, strict=True) if mesh.only_emits]
         together = max(1, min(batches, LANES // (height * width * rounds * grid**2)))
         for first in range(0, batches, together):
             count = min(together, batches - first)
-            passed = _pass(made, material, tiles, grid, rounds, (seed, first, count), depth)
+            passed = _pass(made, material, lamps, tiles, grid, rounds, (seed, first, count), depth)
             sums[first : first + count] = passed.reshape(3, count, -1).swapaxes(0, 1)
     pictures = np.moveaxis(sums / (rounds * grid**2), 1, 2).reshape(batches, height, width, 3)
     meta = {
@@ -121,6 +125,7 @@ def render_exact(
 def _pass(
     scene: JitArray,
     material: BtfMaterial,
+    lamps: list[JitArray],
     tiles: TiledScene,
     grid: int,
     rounds: int,
@@ -129,7 +134,8 @@ def _pass(
 ) -> np.ndarray:
     """Sums of ``rounds`` samples in every cell of every pixel's grid, for some batches; (3, count · pixels) float64.
 
-    ``stream`` is the seed, the number of the first batch, and how many batches follow each other.
+    ``lamps`` are shapes that are lights and nothing else; ``stream`` is the seed, the number of the first batch, and
+    how many batches follow each other.
     """
     import drjit as dr
     import mitsuba as mi
@@ -147,8 +153,11 @@ def _pass(
     si, uv, w_view, lights = _intersect(scene, material, offset, pixel, mi.Point2f(*chosen))
     lights = [(w, dr.select(w.z > 0, power, 0)) for w, power in lights]
     origin = dr.fma(w_view, START, mi.Point3f(uv.x - dr.floor(uv.x), uv.y - dr.floor(uv.y), 0))
-    samples = dr.zeros(mi.Color3f, dr.width(lane))
-    index = dr.compress(si.is_valid() & (w_view.z > 0))
+    samples = dr.zeros(mi.Color3f, dr.width(lane)) + emission(scene, si, si.is_valid())
+    reflects = si.is_valid() & (w_view.z > 0)
+    for lamp in lamps:
+        reflects &= si.shape != mi.ShapePtr(lamp)
+    index = dr.compress(reflects)
     throughput = mi.Color3f(1) + dr.zeros(mi.Color3f, dr.width(lane))
     state = (lane, origin, mi.Vector3f(-w_view), throughput, lights)
     dr.eval(state, samples)
@@ -220,7 +229,7 @@ def _single_material(
         When the scene cannot be read, or shows several materials or none.
     """
     description = read_scene(scene, parameters, size=size)
-    materials = [mesh.material for mesh in description.meshes]
+    materials = [mesh.material for mesh in description.meshes if not mesh.only_emits]
     first = materials[0] if materials else None
     if first is None or not all(
         m is not None
@@ -253,7 +262,7 @@ def _intersect(
     pixel : mitsuba.UInt32
         Flat indices of the pixels.
     chosen : mitsuba.Point2f
-        Random numbers that choose a direction of an environment.
+        Random numbers that choose a direction of an environment, or a point of an area light.
 
     Returns
     -------
@@ -263,7 +272,8 @@ def _intersect(
     w_view : mitsuba.Vector3f
     lights : list of (mitsuba.Vector3f, mitsuba.Color3f)
         Direction in the texture's frame, and irradiance perpendicular to it: 0 where a light does not reach, cast
-        shadows apart. Of an environment one direction, and its radiance over the density of choosing it.
+        shadows apart. Of an environment or an area light one direction, and its radiance over the density of
+        choosing it.
     """
     import drjit as dr
     import mitsuba as mi
@@ -272,7 +282,7 @@ def _intersect(
     si = scene.ray_intersect(ray)
     hits = Hits.at_interaction(material, si)
     lights = []
-    for emitter in distant_or_delta(scene):
+    for emitter in checked_emitters(scene):
         sample, power = emitter.sample_direction(si, chosen, si.is_valid())
         power = dr.select(si.is_valid() & (sample.pdf > 0), mi.Color3f(power), 0)
         lights.append((hits.local(si.to_local(sample.d)), power))

@@ -350,8 +350,21 @@ def _sensor(mi: JitArray, camera: Camera) -> dict[str, Any]:
 
 
 def _light(light: Light) -> dict[str, Any]:
+    import mitsuba as mi
+
     power = {"type": "rgb", "value": [float(value) for value in light.power]}
     position = [float(value) for value in light.position]
     if light.kind == "directional":
         return {"type": "directional", "direction": [-value for value in position], "irradiance": power}
+    if light.kind == "spot":
+        # The beam is round: whichever way is up.
+        up = np.eye(3)[np.abs(light.axis).argmin()].tolist()
+        target = (light.position + light.axis).tolist()
+        return {
+            "type": "spot",
+            "to_world": mi.ScalarTransform4f().look_at(position, target, up),
+            "intensity": power,
+            "cutoff_angle": float(np.degrees(light.cutoff)),
+            "beam_width": float(np.degrees(light.beam_width)),
+        }
     return {"type": "point", "position": position, "intensity": power}

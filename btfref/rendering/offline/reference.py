@@ -14,6 +14,7 @@ from btfref.rendering.offline.direct_light import make_integrator, on_grid
 from btfref.sampling.variant import no_collection
 from btfref.scene.camera import tell_camera
 from btfref.scene.demand import MARGIN, kept_maps, number_kept
+from btfref.scene.emitters.lights import checked_emitters, refuse_directed
 from btfref.scene.loading import loaded
 from btfref.scene.mirrored import seen_mirrored
 from btfref.types import Facts, JitArray, SceneLike
@@ -100,6 +101,9 @@ def render(
     # On a grid, materials under delta lights alone are only evaluated, unless random lights are asked for.
     sampled = True if grid is None or with_variance else None
     with loaded(scene, parameters, variant=variant, size=size, kept=kept, sampled=sampled) as made:
+        if not made.emitters():
+            file = None if isinstance(scene, dict) else scene
+            raise InputError("the scene has no light", file=file, field="emitter")
         found = traced(made, spp=spp, seed=seed, grid=grid, shadows=shadows, with_variance=with_variance)
         if not variant.startswith("scalar"):
             found.meta["mirrored"] = seen_mirrored(made)
@@ -164,6 +168,10 @@ def _monte_carlo(scene: JitArray, spp: int, seed: int, with_variance: bool, shad
     integrator = scene.integrator() if shadows else make_integrator(shadows=False)
     if integrator is None:
         raise InputError("the scene has no integrator", field="integrator", expected="such as path")
+    if shadows and "Particle" not in integrator.class_name():
+        refuse_directed(scene)
+    elif not shadows:
+        checked_emitters(scene)
     settings: Facts = {
         "seed": seed,
         "integrator": integrator.class_name() if hasattr(integrator, "class_name") else "",

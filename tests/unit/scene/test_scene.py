@@ -45,9 +45,12 @@ SHAPES = {
 
 
 STRETCHES = {"": [1, 1, 1], "stretched": [1, 2, 0.5], "mirrored": [-1, 1, 1]}
-#: Mitsuba's round shapes allow rotations, translations and uniform scales only.
+#: Mitsuba's round shapes allow rotations, translations, mirrors and uniform scales only.
 CASES = [
-    (name, how) for name in SHAPES for how in STRETCHES if not how or name.startswith(("rectangle", "cube"))
+    (name, how)
+    for name in SHAPES
+    for how in STRETCHES
+    if how != "stretched" or name.startswith(("rectangle", "cube"))
 ]
 
 
@@ -169,8 +172,54 @@ BAD = {
         '<sensor type="thinlens"><float name="aperture_radius" value="1"/></sensor>',
         "thinlens",
     ),
-    "unsupported light": (SENSOR + '<emitter type="spot"/>', "spot"),
-    "area light": (SENSOR + '<shape type="rectangle"><emitter type="area"/></shape>', "area"),
+    "lens without a size": (SENSOR.replace("perspective", "thinlens"), "aperture_radius|thinlens"),
+    "unsupported light": (SENSOR + '<emitter type="projector"/>', "projector"),
+    "light of Mitsuba 0.6": (SENSOR + '<emitter type="sky"/>', "sunsky with sun_scale 0"),
+    "textured spot": (
+        SENSOR + '<emitter type="spot"><texture name="texture" type="checkerboard"/></emitter>',
+        "textured spot",
+    ),
+    "textured area light": (
+        SENSOR
+        + '<shape type="rectangle"><emitter type="area"><texture name="radiance" type="checkerboard"/>'
+        + "</emitter></shape>",
+        "textured area",
+    ),
+    "light along its normal": (
+        SENSOR + '<shape type="rectangle"><emitter type="directionalarea"/></shape>',
+        "directionalarea.*tracing particles",
+    ),
+    "unknown property": (
+        SENSOR
+        + f'<shape type="rectangle">{MATERIAL.format("<float name=%s value=%s/>")}</shape>'
+        % ('"scall"', '"2"'),
+        "scall.*filename, filter_type, scale",
+    ),
+    "object in a material": (
+        SENSOR + f'<shape type="rectangle">{MATERIAL.format("<bsdf type=%s/>")}</shape>' % '"diffuse"',
+        "nested",
+    ),
+    "instance of an instance": (
+        SENSOR
+        + '<shape type="shapegroup" id="g"><shape type="cube"/></shape>'
+        + '<shape type="shapegroup" id="h"><shape type="instance"><ref id="g"/></shape></shape>'
+        + '<shape type="instance"><ref id="h"/></shape>',
+        "instances within instances",
+    ),
+    "instance of a shape": (SENSOR + '<shape type="instance"><shape type="cube"/></shape>', "shapegroup"),
+    "light in a group": (
+        SENSOR
+        + '<shape type="shapegroup" id="g"><shape type="cube"><emitter type="area"/></shape></shape>'
+        + '<shape type="instance"><ref id="g"/></shape>',
+        "emitters",
+    ),
+    "some faces without uv": (
+        SENSOR
+        + '<shape type="obj" id="part"><string name="filename" value="part.obj"/>'
+        + MATERIAL.format("")
+        + "</shape>",
+        "part.obj, line 9: .*part",
+    ),
     "unknown filter": (
         SENSOR
         + f'<shape type="rectangle">{MATERIAL.format("<string name=%s value=%s/>")}</shape>'
@@ -197,7 +246,10 @@ BAD = {
         "crop_width",
     ),
     "no uv": (
-        SENSOR + '<shape type="ply" id="bare"><string name="filename" value="bare.ply"/></shape>',
+        SENSOR
+        + '<shape type="ply" id="bare"><string name="filename" value="bare.ply"/>'
+        + MATERIAL.format("")
+        + "</shape>",
         "bare",
     ),
     "unknown shape": (SENSOR + '<shape type="sdfgrid"/>', "sdfgrid|failed"),
@@ -212,6 +264,8 @@ def test_bad_scenes_are_one_line(mi, write, tmp_path, name):
     header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
     header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
     (tmp_path / "bare.ply").write_text(header + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    vertices = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\n"
+    (tmp_path / "part.obj").write_text(vertices + "f 1/1 2/2 3/3\nf 1/1 3/3 4 # 1/1\n")
     path = write(body)
     with pytest.raises(InputError, match=reason) as caught:
         read_scene(path)
