@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from btfref.commands.shared.options import add_json, add_overwrite, add_seed
-from btfref.commands.shared.printing import Progress, emit, number, write_representation
+from btfref.commands.shared.options import add_json, add_memory, add_overwrite, add_seed
+from btfref.commands.shared.printing import Progress, bytes_text, emit, number, write_representation
 from btfref.commands.shared.reading import assignments, output_file
 from btfref.errors import InputError
 
@@ -39,6 +39,10 @@ def add_arguments(parser: ArgumentParser) -> None:
         action="store_true",
         help="take a store of which only a part is there, as synth --for fills it (methods that can)",
     )
+    add_memory(
+        parser,
+        "budget of the process, e.g. 2G (default: half of the machine's): a fit that would take more is refused",
+    )
     add_seed(parser)
     add_overwrite(parser)
     add_json(parser, "the facts of the file")
@@ -66,8 +70,9 @@ def run(args: Namespace) -> int:
     parameters = row.settings(args.preset, given)
 
     from btfref.representations import between
+    from btfref.representations.fit_memory import check_budget
     from btfref.representations.protocol import FitsPartially
-    from btfref.sampling import SampledBTF, open_store
+    from btfref.sampling import SampledBTF, memory, open_store
 
     if args.partial:
         fitting = row.fitting
@@ -75,10 +80,13 @@ def run(args: Namespace) -> int:
             raise InputError("the method needs the whole BTF", field="--partial", got=row.key)
         representation = fitting.fit_partial(open_store(args.btf), **parameters)
     else:
-        btf = SampledBTF.load(args.btf)
+        check_budget(row, open_store(args.btf), args.memory)
+        btf = SampledBTF.load(args.btf, variance=False)
         with Progress() as progress:
             representation = between.fit(row, btf, seed=args.seed, progress=progress, **parameters)
     write_representation(representation, out, json=args.json)
+    if not args.json:
+        emit(f"largest memory of the process: {bytes_text(memory.peak())}")
     _say_between(row.key, representation.meta.get("fit", {}).get("between_samples"), json=args.json)
     return 0
 

@@ -267,6 +267,15 @@ class FitModule(Protocol):
 
 
 @runtime_checkable
+class StatesMemory(Protocol):
+    """A module that says how much memory its fit takes."""
+
+    @property
+    def FIT_BYTES(self) -> float:  # noqa: N802 - a constant of a module
+        """Bytes at the peak per value of a sampled BTF of half floats, the BTF itself included."""
+
+
+@runtime_checkable
 class FitsPartially(Protocol):
     """A module that also fits what is there of a store that was filled in part."""
 

@@ -188,10 +188,10 @@ def blocks(
     refuse(budget, budget - free + need(1, lights))
 
 
-def refuse(budget: int, least: int) -> NoReturn:
+def refuse(budget: int, least: int, *, what: str = "memory budget too small for these settings") -> NoReturn:
     """Raise InputError for a budget of fewer bytes than the least that does."""
     raise InputError(
-        "memory budget too small for these settings",
+        what,
         field="memory",
         got=f"{budget / 2**20:.0f} MiB",
         expected=f"at least {least / 2**20:.0f} MiB",
