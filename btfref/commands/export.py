@@ -9,7 +9,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 
 from btfref.commands.shared.options import add_json, add_memory
-from btfref.commands.shared.printing import Progress, emit, emit_json, number
+from btfref.commands.shared.printing import Progress, bytes_text, emit, emit_json, number
 from btfref.commands.shared.reading import assignments, count, number_above, output_file
 from btfref.errors import InputError
 
@@ -72,6 +72,8 @@ def run(args: Namespace) -> int:
     settings = {key: getattr(args, key) for key in _SETTINGS if getattr(args, key) is not None}
     settings |= assignments(args.set)
 
+    from btfref.sampling import memory
+
     with Progress() as progress:
         if args.format == "maps":
             from btfref.formats.maps import export_maps
@@ -87,11 +89,19 @@ def run(args: Namespace) -> int:
                 known = ", ".join([*exporters(), "maps"])
                 raise InputError("no such format to write", field="--format", got=args.format, expected=known)
 
-            facts = export_btf(open_store(args.btf), out, args.format, progress=progress, **settings)
+            facts = export_btf(
+                open_store(args.btf),
+                out,
+                args.format,
+                memory=memory.beside_the_interpreter(args.memory),
+                progress=progress,
+                **settings,
+            )
     if args.json:
-        emit_json(facts)
+        emit_json(facts | {"peak_memory_bytes": memory.peak()})
     else:
         emit(f"{out}: {', '.join(f'{key} {_text(fact)}' for key, fact in facts.items())}")
+        emit(f"largest memory of the process: {bytes_text(memory.peak())}")
     return 0
 
 

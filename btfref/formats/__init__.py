@@ -138,7 +138,9 @@ def import_btf(path: PathLike, out: PathLike, **settings: Any) -> BTFStore:
     return run(path, out, **settings)
 
 
-def export_btf(btf: BTFStore | SampledBTF, path: PathLike, format: str, **settings: object) -> Facts:
+def export_btf(
+    btf: BTFStore | SampledBTF, path: PathLike, format: str, *, memory: int | None = None, **settings: object
+) -> Facts:
     """Write a sampled BTF in a format of others.
 
     Parameters
@@ -148,6 +150,8 @@ def export_btf(btf: BTFStore | SampledBTF, path: PathLike, format: str, **settin
         Must not exist.
     format : str
         Name of a format that can be written.
+    memory : int, optional
+        Bytes to hold at most, beside the interpreter.
     **settings
         Of the writer.
 
@@ -159,6 +163,7 @@ def export_btf(btf: BTFStore | SampledBTF, path: PathLike, format: str, **settin
     Raises
     ------
     InputError
-        A format that is only read, an existing path, or values or directions that the format cannot hold.
+        A format that is only read, an existing path, too small a memory, or values or directions that the format cannot
+        hold.
     """
-    return format_named(format).export_checked(btf, path, settings)
+    return format_named(format).export_checked(btf, path, settings, memory=memory)

@@ -12,6 +12,13 @@ from btfref.sampling.sampled_btf import SampledBTF
 
 if TYPE_CHECKING:
     from btfref.sampling.store.store import BTFStore
+    from btfref.types import Facts
+
+#: Copies of a view while it is read from a store: itself, a file's bytes and what they decode to.
+VIEW_COPIES = 4
+
+#: Bytes per value of a picture on its way into a file: in float32, scaled, encoded.
+PICTURE_BYTES = 64
 
 
 class PartReader(Protocol):
@@ -66,3 +73,10 @@ def open_parts(btf: BTFStore | SampledBTF) -> PartReader:
     if not btf.complete:
         raise InputError("incomplete", file=btf.path, field="coverage", got=f"{btf.coverage.mean():.1%}")
     return _Stored(btf)
+
+
+def one_view(shape: tuple[int, ...], itemsize: int, settings: Facts) -> int:
+    """Bytes that a writer holds which goes view by view: ``peak`` of a `btfref.formats.source.Format`."""
+    _, n_lights, rows, columns, _ = shape
+    picture = 3 * rows * columns
+    return VIEW_COPIES * itemsize * n_lights * picture + PICTURE_BYTES * picture

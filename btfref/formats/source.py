@@ -20,11 +20,11 @@ from btfref.numerics.sphere.directions import (
     spherical,
 )
 from btfref.outputs import refuse_existing, require_folder_of
+from btfref.sampling.sampled_btf import SampledBTF
 from btfref.types import Facts, PathLike
 
 if TYPE_CHECKING:
     from btfref.formats.image_sets.files import Candidate
-    from btfref.sampling.sampled_btf import SampledBTF
     from btfref.sampling.store.store import BTFStore
 
 #: Bytes that a conversion may hold at a time, unless told otherwise.
@@ -131,6 +131,9 @@ class Format:
         ``export(btf, path, **settings) -> dict``; None for a format that is only read.
     settings : frozenset of str
         What `export` takes.
+    peak : callable, optional
+        ``peak(shape, itemsize, settings) -> int``: bytes that `export` holds at most of a BTF of that shape and type,
+        beside the interpreter; None where it is not known, and no budget can be kept.
     """
 
     name: str
@@ -140,22 +143,47 @@ class Format:
     options: frozenset[str] = frozenset()
     export: Callable[..., Facts] | None = None
     settings: frozenset[str] = frozenset()
+    peak: Callable[[tuple[int, ...], int, Facts], int] | None = None
 
     def open_checked(self, path: PathLike, options: Mapping[str, object]) -> Source:
         """`open` with options that were given (None counts as not given) and that the format knows."""
         return self.open(path, **self._known(options, self.options))
 
     def export_checked(
-        self, btf: BTFStore | SampledBTF, path: PathLike, settings: Mapping[str, object]
+        self,
+        btf: BTFStore | SampledBTF,
+        path: PathLike,
+        settings: Mapping[str, object],
+        *,
+        memory: int | None = None,
     ) -> Facts:
-        """`export` likewise, to a path that does not exist."""
+        """`export` likewise, to a path that does not exist; ``memory`` in bytes is what it may hold at most."""
         if self.export is None:
             raise InputError("this format is only read", field="format", got=repr(self.name))
         settings = self._known(settings, self.settings | {"progress"})
+        if memory is not None:
+            self._check(memory, btf, settings)
+            if "memory" in self.settings:
+                settings = {"memory": memory, **settings}
         path = Path(path)
         refuse_existing(path)
         require_folder_of(path)
         return self.export(btf, path, **settings)
+
+    def _check(self, memory: int, btf: BTFStore | SampledBTF, settings: Facts) -> None:
+        """InputError for a budget that cannot be kept."""
+        if self.peak is None:
+            return
+        shape = (len(btf.views), len(btf.lights), *btf.texels, 3)
+        dtype = btf.values.dtype if isinstance(btf, SampledBTF) else btf.dtype
+        need = self.peak(shape, np.dtype(dtype).itemsize, settings)
+        if need > memory:
+            raise InputError(
+                f"writing {self.name} holds more than the memory allowed",
+                field="memory",
+                got=f"{memory / 2**20:.0f} MiB for the BTF",
+                expected=f"at least {need / 2**20:.0f} MiB",
+            )
 
     def _known(self, given: Mapping[str, object], known: frozenset[str]) -> Facts:
         given = {key: value for key, value in given.items() if value is not None}

@@ -24,7 +24,10 @@ if TYPE_CHECKING:
 #: Scan lines per chunk that the owners' writer uses.
 SCAN_LINES = 4
 
-_LARGEST_RANK = 512
+LARGEST_RANK = 512
+
+#: Columns of a subspace beyond the rank that is wanted.
+OVERSAMPLED = 8
 
 #: Passes over the data after the first: each sharpens the subspace.
 _PASSES = 2
@@ -140,7 +143,7 @@ def _write_dfmf(
         raise InputError("bytes of a factor", field="scalar", got=scalar, expected="2 or 4")
     if components is not None and error is not None:
         raise InputError("components and error both given", field="components", expected="one of them")
-    largest = min(len(source.views) * len(source.lights), source.texels[0] * source.texels[1], _LARGEST_RANK)
+    largest = min(len(source.views) * len(source.lights), source.texels[0] * source.texels[1], LARGEST_RANK)
     if components is not None and (isinstance(components, bool) or not 1 <= components):
         raise InputError("components", field="components", got=components, expected="at least 1")
     if error is not None and not 0 < error < 1:
@@ -192,7 +195,7 @@ def _factors(
     """
     n_views, n_lights = len(source.views), len(source.lights)
     n_texels = source.texels[0] * source.texels[1]
-    width = min(rank + 8, n_texels, n_views * n_lights)
+    width = min(rank + OVERSAMPLED, n_texels, n_views * n_lights)
     rng = np.random.default_rng(0)
     bases = [rng.standard_normal((n_texels, width), dtype=np.float32) for _ in range(3)]
     total, steps = np.zeros(3), 0

@@ -15,6 +15,7 @@ from btfref.errors import InputError
 from btfref.formats.bonn import colour
 from btfref.formats.bonn.bdi import BDI
 from btfref.formats.bonn.header import Header, read_header, signature_of, to_rgb
+from btfref.formats.parts import one_view
 from btfref.formats.reading import Reader
 from btfref.formats.source import LARGEST_COUNT, Format, Source
 from btfref.types import Facts, PathLike
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 
 _SCALARS = {2: "<f2", 4: "<f4", 8: "<f8"}
 _LARGEST_RANK = 1 << 16
+
+#: Sizes of a block of scan lines that BDI is written by, the least: as read, in the file's order, and a chunk's bytes.
+BLOCK_COPIES = 4
 
 
 def recognises(candidate: Candidate) -> bool:
@@ -291,11 +295,28 @@ def export(btf: BTFStore | SampledBTF, path: PathLike, **settings: Any) -> Facts
     return export_bonn(btf, path, **settings)
 
 
+def peak(shape: tuple[int, ...], itemsize: int, settings: Facts) -> int:
+    """Bytes that :func:`export` holds at its peak: ``peak`` of a `btfref.formats.source.Format`."""
+    from btfref.formats.bonn.export import LARGEST_RANK, OVERSAMPLED, SCAN_LINES
+
+    n_views, n_lights, rows, columns, _ = shape
+    pairs, texels = n_views * n_lights, rows * columns
+    if settings.get("family") == "BDI":
+        return BLOCK_COPIES * itemsize * pairs * 3 * SCAN_LINES * columns
+    rank = settings.get("components") or (LARGEST_RANK if "error" in settings else 64)
+    width = min(rank + OVERSAMPLED, texels, pairs)
+    # A view as read, as float32 in the colour model and as three matrices; bases and sums of the texels' side of all
+    # channels, factors of the other side, one of which is decomposed in float64.
+    view = one_view(shape, itemsize, settings) + 3 * 4 * 3 * n_lights * texels
+    return view + 3 * 4 * width * (3 * texels + pairs) + 3 * 8 * width * pairs
+
+
 FORMAT = Format(
     "bonn",
     "Bonn's binary BTFs: DFMF, FMF, PVF, BDI",
     recognises,
     open_bonn,
     export=export,
+    peak=peak,
     settings=frozenset({"family", "components", "error", "colour_model", "scalar", "memory"}),
 )

@@ -12,6 +12,7 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.formats.image_sets.reader import image_source, pick, recogniser
+from btfref.formats.parts import one_view
 from btfref.formats.source import Format, Source
 from btfref.types import Facts, PathLike
 
@@ -87,5 +88,6 @@ FORMAT = Format(
     open_ubo,
     options=frozenset({"allow_missing", "gamma", "pattern"}),
     export=export,
+    peak=one_view,
     settings=frozenset({"image", "gamma", "quality", "scale", "moved"}),
 )

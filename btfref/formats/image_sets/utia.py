@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from btfref.errors import InputError
 from btfref.formats.image_sets.reader import opener, pick, recogniser
+from btfref.formats.parts import one_view
 from btfref.formats.source import Format
 from btfref.numerics.colour import RGB_TO_XYZ, decode_srgb, encode_srgb, rgb_from_xyz
 from btfref.types import Facts, PathLike
@@ -76,5 +77,6 @@ FORMAT = Format(
     opener("utia", _to_linear, cosine_included=False, scale=SCALE),
     options=frozenset({"allow_missing", "pattern"}),
     export=export,
+    peak=one_view,
     settings=frozenset({"image", "scale", "moved"}),
 )
