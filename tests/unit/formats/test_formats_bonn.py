@@ -233,7 +233,7 @@ def sampled():
 
 
 def test_bdi_round_trip_is_exact(sampled, tmp_path):
-    export_btf(sampled, tmp_path / "x.btf", "bonn", family="BDI", memory=1 << 20)
+    export_btf(sampled, tmp_path / "x.btf", "bonn", family="BDI", memory=6 << 20)
     back = SampledBTF.load(import_btf(tmp_path / "x.btf", tmp_path / "x.btf.zarr", memory=64 << 20).path)
     assert np.array_equal(back.values, sampled.values)
     assert back.views == sampled.views
