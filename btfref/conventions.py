@@ -86,7 +86,7 @@ class PixelClass(IntEnum):
     SILHOUETTE = 2
     MESOSTRUCTURE = 3
     EDGE = 4
-    OTHER = 6
+    OTHER = 5
 
     @property
     def label(self) -> str:

@@ -1,9 +1,8 @@
 """Render a Mitsuba scene with OpenGL: the real-time image.
 
 Meshes, spheres, disks and cylinders with BTFs or other materials (diffuse exactly, the rest as their mean albedo), a
-perspective camera, directional, point, spot and area lights, and an envmap, sunsky or
-constant emitter. No cast shadows: compare with `btfref render --no-shadows`. The image is the mean of a regular
-sub-pixel grid (--grid).
+perspective camera, directional, point, spot and area lights, and an envmap, sunsky or constant emitter. No cast
+shadows: compare with `btfref render --no-shadows`. The image is the mean of a regular sub-pixel grid (--grid).
 
 --environment says how an envmap lights: "prefiltered" maps, for the methods that have them, "lights", directional
 lights that stand for it, for any method, or "auto", the first of these that there is; "sh", spherical harmonics, for

@@ -222,8 +222,6 @@ def test_realtime_refuses_what_it_cannot_show(llvm):
     sphere = {"a": {"type": "sphere", "bsdf": {"type": "conductor"}}}
     with pytest.raises(InputError, match="light"):
         realtime(room(llvm, shapes={}, lights={}))
-    with pytest.raises(InputError, match="conductor"):
-        realtime(room(llvm, shapes=sphere, lights=LIGHTS))
     with pytest.raises(InputError, match="grid"):
         realtime(room(llvm, shapes={}, lights=LIGHTS), grid=0)
     lamp = {"a": {"type": "sphere", "emitter": {"type": "directionalarea"}}}
