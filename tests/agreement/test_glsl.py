@@ -71,6 +71,7 @@ STAGES = [
     ("hosts/probe.vert", "hosts/probe.frag"),
     ("hosts/mesh.vert", "hosts/mesh.frag"),
     ("hosts/mesh.vert", "hosts/seen.frag"),
+    ("hosts/mesh.vert", "hosts/emitter.frag"),
     ("hosts/screen.vert", "hosts/depth.frag"),
 ]
 
