@@ -66,8 +66,9 @@ def write(tmp_path, fits):
     return write
 
 
-def held(image, reference, scene, gate=GATES, grid=GRID):
-    found = compare(image, reference, classes=pixel_classes(scene, grid=grid), gate=gate, flip=False)
+def held(image, reference, scene, gate=GATES, grid=GRID, size=None):
+    classes = pixel_classes(scene, grid=grid, size=size)
+    found = compare(image, reference, classes=classes, gate=gate, flip=False)
     return [found.passed, *(gate.line for gate in found.gates if not gate.passed)]
 
 
@@ -94,11 +95,12 @@ def test_two_instances_under_a_spot_and_an_area_light(write):
 def test_points_against_light_from_all_over_an_area(write, monkeypatch):
     """Equivalence, and a light without its own cosine is caught."""
     scene = write(FLOOR, LAMP)
-    gate = "image.area_lights"
-    classes = pixel_classes(scene, grid=GRID)
-    reference = converged(scene, classes == PixelClass.INTERIOR, gate=gate, shadows=False, grid=GRID)
+    gate, small = "image.area_lights", {"size": (16, 12)}
+    classes = pixel_classes(scene, grid=GRID, **small)
+    inside = classes == PixelClass.INTERIOR
+    reference = converged(scene, inside, gate=gate, shadows=False, grid=GRID, **small)
     assert reference.meta["noise_ratio"] <= 1
-    assert held(realtime(scene, grid=GRID), reference, scene, gate) == [True]
+    assert held(realtime(scene, grid=GRID, **small), reference, scene, gate, **small) == [True]
     made = renderer.light_table
 
     def points(lights):
@@ -107,7 +109,7 @@ def test_points_against_light_from_all_over_an_area(write, monkeypatch):
         return table
 
     monkeypatch.setattr(renderer, "light_table", points)
-    assert held(realtime(scene, grid=GRID), reference, scene, gate)[0] is False
+    assert held(realtime(scene, grid=GRID, **small), reference, scene, gate, **small)[0] is False
 
 
 def test_mirrored_instances_of_shapes_with_face_normals(write):
