@@ -81,7 +81,8 @@ class MeshDescription:
         Mitsuba plugin of the shape.
     positions : ndarray of float, shape (n, 3)
     normals : ndarray of float, shape (n, 3), or None
-        Unit shading normals; None means geometric ones.
+        Shading normals, to be normalised once they are interpolated: unit vectors but where an instance stretches them.
+        None means geometric ones.
     uv : ndarray of float, shape (n, 2)
     faces : ndarray of int, shape (m, 3)
         Counter-clockwise around the geometric normal.
@@ -297,7 +298,9 @@ def triangles_of(
                 # A mirror turns the order of corners round, and Mitsuba's normals of instances not.
                 flip ^= bool(np.linalg.det(outer[:3, :3]) < 0)
             else:
-                normals = _unit(normals @ np.linalg.inv(outer[:3, :3]))
+                # Mitsuba interpolates first and transforms then: a common factor keeps the weights of the corners.
+                normals = normals @ np.linalg.inv(outer[:3, :3])
+                normals /= np.linalg.norm(normals, axis=1).max(initial=1e-30)
         faces = np.array(arrays["faces"]).reshape(-1, 3).astype(np.int64)
         if shape.has_vertex_texcoords():
             uv = np.array(arrays["vertex_texcoords"]).reshape(-1, 2)

@@ -99,15 +99,22 @@ void main() {
 #endif
 #endif
     // Mitsuba's area light shines on the side of the shading normal.
-    vec3 own_light = pass == 0 && dot(point.normal, direction) < 0.0 ? emission : vec3(0.0);
+#if !defined(HAS_BINS)
+    bool first = pass == 0;
+#elif N_LIGHTS > 0
+    bool first = bin < 0 && light_first == 0;
+#else
+    bool first = false;
+#endif
+    vec3 own_light = first && dot(point.normal, direction) < 0.0 ? emission : vec3(0.0);
 #ifdef COUNT_FETCHES
     // Instead of coverage: the texels that the representation fetched.
     radiance = vec4(scale * sum, float(fetches));
 #elif defined(HAS_BINS)
     // Coverage comes from the pass that drew the depth: bins add up.
-    radiance = vec4(scale * sum + own_light, 0.0);
+    radiance = vec4(scale * sum, 0.0);
 #else
     radiance = vec4(scale * sum, 1.0);
-    radiance.rgb += own_light;
 #endif
+    radiance.rgb += own_light;
 }

@@ -259,6 +259,8 @@ def emission(scene: JitArray, si: JitArray, active: JitArray) -> JitArray:
     import drjit as dr
     import mitsuba as mi
 
+    if not any(is_area(emitter) for emitter in scene.emitters()):
+        return dr.zeros(mi.Spectrum, dr.width(si))
     light = si.emitter(scene, active)
     return dr.select(active, light.eval(si, active & (light != mi.EmitterPtr(None))), 0)
 

@@ -305,7 +305,13 @@ def test_a_store_where_a_representation_is_wanted(arguments, folder, capsys):
     ("parts", "words"),
     [
         ({"light": '<emitter type="nonsense"/>'}, ["nonsense"]),
+        ({"light": ""}, ["scene.xml", "no light"]),
+        ({"light": '<emitter type="sky"/>'}, ["sunsky with sun_scale 0"]),
         ({"sensor": ""}, ["sensor"]),
+        (
+            {"shape": SHAPE.replace("</bsdf>", '<float name="scall" value="2"/></bsdf>')},
+            ["scall", "filter_type"],
+        ),
         ({"shape": '<shape type="ply"><string name="filename" value="none.ply"/></shape>'}, ["none.ply"]),
         ({"shape": SHAPE.replace("$btf", "none.exr")}, ["none.exr"]),
         ({"shape": SHAPE.replace('name="filename"', 'name="file"')}, ["filename"]),
@@ -320,11 +326,11 @@ def test_bad_scenes(command, parts, words, folder, capsys):
     refuse(folder, capsys, command, "scene.xml", "-o", "out.exr", *options, words=words)
 
 
-def test_an_environment_that_has_no_picture(folder, capsys):
-    """Mitsuba's sun and sky: the reference shows it, the real-time renderer wants an envmap or a constant."""
-    light = '<emitter type="sunsky"/>'
+def test_a_light_that_real_time_lacks(folder, capsys):
+    """The reference shows it."""
+    light = '<emitter type="projector"/>'
     (folder / "scene.xml").write_text(SCENE.format(sensor=SENSOR, shape=SHAPE, light=light))
-    refuse(folder, capsys, "realtime", "scene.xml", "-o", "out.exr", words=["sunsky"])
+    refuse(folder, capsys, "realtime", "scene.xml", "-o", "out.exr", words=["projector"])
 
 
 @pytest.mark.parametrize("content", [b"", b"\x00\xff", b"<scene>", b"no scene at all"])
