@@ -10,8 +10,9 @@ from btfref.cli import main
 from btfref.comparison import compare
 from btfref.conventions import PixelClass
 from btfref.gates import tolerance
+from btfref.rendering.environment_light.lighting import lighting_of
 from btfref.rendering.gl import composer, device
-from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.gl.renderer import Renderer, realtime
 from btfref.rendering.offline.approximate import approximate
 from btfref.rendering.offline.reference import render
 from btfref.scene.description import read_scene
@@ -150,6 +151,20 @@ def test_a_diffuse_surface_under_an_environment(llvm, fits, way):
     expected = approximate(scene, grid=1, size=size, path=way)
     assert image.image[np.isin(classes, (PixelClass.INTERIOR, PixelClass.OTHER))].min() > 0
     assert_passed(compare(image, expected, classes=classes, gate=GATES, flip=False))
+
+
+def test_plain_surfaces_follow_an_environment_that_changes(llvm, fits):
+    llvm.set_variant("scalar_rgb")
+    scene = room(llvm, [{"type": "btf", "filename": str(fits.path("lpca"))}, {"type": "diffuse"}])
+    del scene["sun"], scene["lamp"]
+    pictures, skies = [], ({"type": "constant"}, {"type": "envmap", "filename": "studio"})
+    described = [read_scene({**scene, "sky": sky}, size=(36, 32)) for sky in skies]
+    for first in described:
+        with Renderer(first, lighting=lighting_of(first, "transfer")) as renderer:
+            renderer.relight(described[1].environment)
+            renderer.draw()
+            pictures.append(renderer.read().copy())
+    assert_passed(compare(*pictures, gate="image.noise_free", flip=False))
 
 
 ALBEDOS = {
