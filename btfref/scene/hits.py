@@ -25,7 +25,7 @@ from btfref.types import JitArray
 
 if TYPE_CHECKING:
     from btfref.scene.reading.instances import Drawn
-    from btfref.scene.shapes import BtfMaterial, MeshDescription
+    from btfref.scene.shapes import MeshDescription, Shown
 
 #: Shapes whose triangles are a tessellation of ours.
 ANALYTIC = ("sphere", "disk", "cylinder")
@@ -100,7 +100,7 @@ class Hits:
 
     Parameters
     ----------
-    material : BtfMaterial
+    material : BtfMaterial or PlainMaterial
     uv : ndarray, shape (N, 2), or mitsuba.Point2f
         Of the shape.
     wi : ndarray, shape (N, 3), or mitsuba.Vector3f
@@ -114,7 +114,7 @@ class Hits:
 
     def __init__(
         self,
-        material: BtfMaterial,
+        material: Shown,
         uv: JitArray,
         wi: JitArray,
         hand: JitArray,
@@ -126,12 +126,12 @@ class Hits:
         self._surface, self._at = surface, at
 
     @classmethod
-    def of(cls, surface: Surface, material: BtfMaterial, at: np.ndarray) -> Hits:
+    def of(cls, surface: Surface, material: Shown, at: np.ndarray) -> Hits:
         """Those of the pixels ``at`` of a surface, shape (N,) int."""
         return cls(material, surface["uv"][at], surface["wi"][at], surface.hand[at], surface=surface, at=at)
 
     @classmethod
-    def at_interaction(cls, material: BtfMaterial, si: JitArray) -> Hits:
+    def at_interaction(cls, material: Shown, si: JitArray) -> Hits:
         """Those of Mitsuba's surface interactions, as Dr.Jit arrays."""
         from mitsuba_plugins.lib.frame import hand_of
 
@@ -272,7 +272,7 @@ def corner_frames(mesh: MeshDescription) -> np.ndarray:
     return np.swapaxes(turned_frame(frame, mesh.btf), -1, -2)
 
 
-def turned_frame(frame: np.ndarray, material: BtfMaterial) -> np.ndarray:
+def turned_frame(frame: np.ndarray, material: Shown) -> np.ndarray:
     """Frames, rows s, t, n in shape (..., 3, 3), taken to that of the transformed texture."""
     s, t, n = np.moveaxis(frame, -2, 0)
     return np.stack([*_turned(material.turn, s, t), n], -2)

@@ -337,6 +337,8 @@ def material_of(parsed: ParsedScene, shape: JitArray) -> tuple[str, BtfMaterial 
     if plugin == "twosided":
         inner = [child for _, child in parsed.children(node)]
         if len(inner) > 1:
+            if all(child.props.plugin_name() != BTF for child in inner):
+                return plugin, None
             raise InputError(
                 "unsupported: twosided with two materials", file=parsed.location(node), field="twosided"
             )

@@ -65,6 +65,10 @@ class BtfMaterial:
         return nearest_turn(self.to_uv[:, :2])
 
 
+#: What a shape shows.
+Shown = BtfMaterial | PlainMaterial
+
+
 @dataclass(frozen=True)
 class MeshDescription:
     """Triangles of one shape, in world space.
@@ -121,7 +125,7 @@ class MeshDescription:
         return self.material is None and self.bsdf == "none" and bool(np.any(self.emission > 0))
 
     @property
-    def shown(self) -> BtfMaterial | PlainMaterial:
+    def shown(self) -> Shown:
         """What is shown: the BTF, or what stands for another material.
 
         Raises

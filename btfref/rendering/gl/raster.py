@@ -16,14 +16,11 @@ from btfref.scene.shapes import neighbours
 if TYPE_CHECKING:
     from btfref.rendering.environment_light.prepared import Prepared
     from btfref.scene.description import Camera, Light
-    from btfref.scene.shapes import BtfMaterial, MeshDescription
-    from btfref.scene.surfaces.materials import PlainMaterial
+    from btfref.scene.shapes import MeshDescription, Shown
     from btfref.types import Facts
 
 
-def material_uniforms(
-    material: BtfMaterial | PlainMaterial, texels: tuple[int, int], angle: float
-) -> dict[str, Any]:
+def material_uniforms(material: Shown, texels: tuple[int, int], angle: float) -> dict[str, Any]:
     """What ``shaders/hosts/mesh.frag`` and ``shaders/lib/surface/lod.glsl`` read of a material.
 
     Parameters

@@ -17,7 +17,7 @@ import numpy as np
 from btfref import representations
 from btfref.errors import GRID, BtfrefError, InputError, refuse_above
 from btfref.rendering import RenderResult
-from btfref.rendering.environment_light.lighting import lighting_of
+from btfref.rendering.environment_light.lighting import Lighting, lighting_of
 from btfref.rendering.gl import device, quadrics
 from btfref.rendering.gl.raster import (
     clip_planes,
@@ -34,7 +34,6 @@ from btfref.scene.surfaces.materials import PlainMaterial
 from btfref.types import Facts, JitArray, SceneLike
 
 if TYPE_CHECKING:
-    from btfref.rendering.environment_light.lighting import Lighting
     from btfref.rendering.environment_light.prepared import Prepared
     from btfref.rendering.environment_light.transfer import TransferSettings
     from btfref.rendering.environment_light.transfer_light import TransferLight
@@ -244,7 +243,7 @@ class Renderer:
         what = material if isinstance(material, PlainMaterial) else material.filename
         key = (what, material.filter_type, own, exact)
         if key not in self._shown:
-            rep = what if isinstance(what, PlainMaterial) else load_file(what)
+            rep = what.representation if isinstance(what, PlainMaterial) else load_file(what)
             light = None
             if lighting is not None:
                 file = what if isinstance(what, str) else None
@@ -425,11 +424,20 @@ class Renderer:
         if self._lighting is None or not self._lighting.per_mesh:
             raise InputError("only transferred light changes", field="environment", expected="transfer")
         coefficients = self._lighting.coefficients_of(environment)
-        for shown, _, _, light in self._shown.values():
+        # The lights of other materials than BTFs follow when nothing moves any longer.
+        lights = None if moving else Lighting(environment, "lights")
+        for key, (shown, program, vertices, light) in self._shown.items():
             assert light is not None
-            assert light.transfer is not None
-            light.transfer.relight(coefficients, moving=moving)
-            for name, table in light.transfer.tables().items():
+            if light.transfer is not None:
+                light.transfer.relight(coefficients, moving=moving)
+                tables = light.transfer.tables()
+            elif lights is not None and isinstance(key[0], PlainMaterial):
+                light = lights.prepared(key[0].representation)
+                self._shown[key] = shown, program, vertices, light
+                tables = light.tables
+            else:
+                continue
+            for name, table in tables.items():
                 shown.textures.pop(name).release()
                 shown.textures[name] = device.upload(self.ctx, table, name)
 

@@ -93,10 +93,9 @@ def approximate(
                 hits = Hits.of(surface, mesh.shown, np.flatnonzero(seen))
                 if not len(hits.at):
                     continue
-                if mesh.material is None:
-                    rep, light = mesh.plain, None
-                    if lighting is not None:
-                        light = lighting.of_plain.prepared(rep)
+                if mesh.material is None and mesh.plain is not None:
+                    rep = mesh.plain.representation
+                    light = None if lighting is None else lighting.of_plain.prepared(rep)
                     total[hits.at] += _radiance(rep, hits, mesh, description, grid, light)
                     continue
                 name = mesh.btf.filename

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,6 +23,7 @@ from btfref.numerics.sphere.frames import Turn
 from btfref.types import Facts, JitArray
 
 if TYPE_CHECKING:
+    from btfref.representations.protocol import Representation
     from btfref.scene.parsing import ParsedScene
 
 #: How a bitmap continues beyond its borders, by the number that shaders know.
@@ -70,6 +71,11 @@ class PlainMaterial:
     lod_bias: ClassVar[float] = 0.0
     lod_unit: ClassVar[float] = 1.0
     turn: ClassVar[Turn] = Turn()
+
+    @property
+    def representation(self) -> Representation:
+        """Itself, for hosts, which neither sample it nor read it from a file."""
+        return cast("Representation", self)
 
     @property
     def albedo(self) -> np.ndarray:

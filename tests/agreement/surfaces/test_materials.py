@@ -1,5 +1,6 @@
 """Materials beside BTFs: diffuse exactly, every other one as its mean albedo, and what judges them."""
 
+import subprocess
 from itertools import product
 
 import numpy as np
@@ -9,11 +10,14 @@ from btfref.cli import main
 from btfref.comparison import compare
 from btfref.conventions import PixelClass
 from btfref.gates import tolerance
-from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.environment_light.lighting import lighting_of
+from btfref.rendering.gl import composer, device
+from btfref.rendering.gl.renderer import Renderer, realtime
 from btfref.rendering.offline.approximate import approximate
 from btfref.rendering.offline.reference import render
 from btfref.scene.description import read_scene
 from btfref.scene.pixel_classes import pixel_classes
+from btfref.scene.surfaces.materials import PlainMaterial
 
 pytestmark = pytest.mark.usefixtures("renderers")
 
@@ -149,10 +153,25 @@ def test_a_diffuse_surface_under_an_environment(llvm, fits, way):
     assert_passed(compare(image, expected, classes=classes, gate=GATES, flip=False))
 
 
+def test_plain_surfaces_follow_an_environment_that_changes(llvm, fits):
+    llvm.set_variant("scalar_rgb")
+    scene = room(llvm, [{"type": "btf", "filename": str(fits.path("lpca"))}, {"type": "diffuse"}])
+    del scene["sun"], scene["lamp"]
+    pictures, skies = [], ({"type": "constant"}, {"type": "envmap", "filename": "studio"})
+    described = [read_scene({**scene, "sky": sky}, size=(36, 32)) for sky in skies]
+    for first in described:
+        with Renderer(first, lighting=lighting_of(first, "transfer")) as renderer:
+            renderer.relight(described[1].environment)
+            renderer.draw()
+            pictures.append(renderer.read().copy())
+    assert_passed(compare(*pictures, gate="image.noise_free", flip=False))
+
+
 ALBEDOS = {
     "checkerboard": ({"type": "diffuse", "reflectance": {"type": "checkerboard"}}, 0.3),
     "half opaque": ({"type": "mask", "opacity": 0.5, "inner": {"type": "diffuse"}}, 0.25),
     "nothing": ({"type": "null"}, 0.0),
+    "two sides": ({"type": "twosided", "front": {"type": "diffuse"}, "back": {"type": "conductor"}}, 0.5),
     "mirror": ({"type": "conductor", "material": "none"}, 1.0),
     "rough": ({"type": "roughconductor", "material": "none", "alpha": 0.05}, 1.0),
 }
@@ -181,3 +200,18 @@ def test_a_scene_without_a_btf_is_drawn_and_says_what_stands_for_what(llvm, tmp_
     said = [line for line in capsys.readouterr().out.splitlines() if "albedo" in line]
     assert len(said) == 1
     assert "block: principled" in said[0]
+
+
+@pytest.mark.parametrize("target", composer.TARGETS)
+def test_glslang_accepts_diffuse(need, tmp_path, target):
+    validator = need("glslang")
+    for filter_type, exact in product(("bilinear", "nearest"), ({}, {"QUADRIC": 1})):
+        rep = PlainMaterial(np.full((1, 1, 3), 0.5, np.float32), filter_type).representation
+        shader, _ = device.shader_file(rep)
+        defines = {**device.shader_defines(rep), "N_LIGHTS": 2, **exact}
+        source = composer.compose("hosts/mesh.frag", defines, representation=shader, target=target)
+        (tmp_path / "mesh.frag").write_text(source, encoding="utf-8")
+        done = subprocess.run(
+            [validator, str(tmp_path / "mesh.frag")], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, source.explain(done.stdout)

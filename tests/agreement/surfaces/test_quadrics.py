@@ -100,6 +100,22 @@ def test_each_shape_alone(llvm, fits, key):
         assert_passed(judged(scene, realtime(scene, grid=GRID)))
 
 
+@pytest.mark.parametrize("scale", [[0.5, 0.9, 0.6], pytest.param([-0.6, 0.6, 0.6], marks=pytest.mark.long)])
+def test_exact_shapes_of_an_instance(llvm, fits, scale):
+    """Stretched and mirrored: Mitsuba meets them in the group's space, and so does the shader."""
+    llvm.set_variant("scalar_rgb")
+    known, transform = shapes_of(llvm), llvm.ScalarTransform4f
+    scene = scene_of(llvm, [], None)
+    both = {"type": "twosided", "inner": btf(fits, FIRST)}
+    shapes = {name: {**known[name], "bsdf": both} for name in ("sphere", "from inside")}
+    shapes["disk"] = {"type": "disk", "to_world": transform().translate([0.2, 0.8, 1.4]), "bsdf": both}
+    shapes["from inside"]["p1"] = [0.1, 1.2, 1.7]
+    scene["group"] = {"type": "shapegroup", **{name.split()[-1]: shape for name, shape in shapes.items()}}
+    turned = transform().rotate([0.6, 0.8, 0], 50) @ transform().scale(scale)
+    scene["instance"] = {"type": "instance", "to_world": turned, "group": {"type": "ref", "id": "group"}}
+    assert_passed(judged(scene, realtime(scene, grid=GRID)))
+
+
 def test_triangles_in_their_place_fail(llvm, fits):
     llvm.set_variant("scalar_rgb")
     scene = scene_of(llvm, [shapes_of(llvm)["pole"]], btf(fits, FIRST))
