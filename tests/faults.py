@@ -315,6 +315,14 @@ ROWS = [
         "synth flat -o new.btf.zarr --texels 2 --spp 2 --memory 1M",
         ("memory",),
     ),
+    Row("memory", "too small a budget", "fit svd good.btf.zarr -o out.exr --memory 100M", ("memory",)),
+    Row("memory", "too small a budget", "import image.exr -o new.btf.zarr --memory 100M", ("memory",)),
+    Row(
+        "memory",
+        "too small a budget",
+        "export good.btf.zarr --format bonn -o new.btf --memory 100M",
+        ("memory",),
+    ),
     # 7
     Row(
         "locks",
