@@ -1,8 +1,9 @@
-// Provides the radiance towards the camera under directional and point lights and an environment, without cast shadows.
+// Provides the radiance towards the camera under directional and point lights, with cast shadows if any, and an environment.
 // Expects a representation, the tables of hosts/mesh.vert, the camera's rays, the lights and the material.
 
 #include "lib/surface/frame.glsl"
 #include "lib/light/lights.glsl"
+#include "lib/light/shadows.glsl"
 #include "lib/surface/lod.glsl"
 #include "lib/surface/triangle_table.glsl"
 #include "representation"
@@ -67,6 +68,9 @@ void main() {
         vec3 irradiance = light_incident(i, point.position, towards);
         vec3 w_light = to_local * towards;
         w_light.z *= side;
+        if (!light_reaches(i, point.position, point.plane_normal)) {
+            continue;
+        }
         // B holds the cosine of the light (design: conventions), nothing else is multiplied.
         sum += irradiance * btf_eval(uv, w_light, w_view, lod);
     }

@@ -1,7 +1,7 @@
 """The real-time renderer: the same scene through GLSL, without a window.
 
-Direct light of directional and point lights and of an environment
-(:mod:`btfref.rendering.environment_light.lighting`), without cast shadows; the environment itself is not drawn. The
+Direct light of directional and point lights, with cast shadows (:mod:`btfref.rendering.gl.shadows`), and of an
+environment (:mod:`btfref.rendering.environment_light.lighting`), without; the environment itself is not drawn. The
 sub-pixel grid is that of :mod:`btfref.rendering.offline.reference`: n × n regular
 samples a pixel, box filter. Each sample is one frame with a shifted projection; frames are added in float64.
 """
@@ -26,9 +26,11 @@ from btfref.rendering.gl.raster import (
     triangle_table,
     world_to_clip,
 )
+from btfref.rendering.gl.shadows import ShadowMaps
 from btfref.scene.demand import MARGIN, kept_maps, number_kept
 from btfref.scene.description import SceneDescription, read_scene
 from btfref.scene.mirrored import mirrored_meshes
+from btfref.scene.occluders import has_occluders
 from btfref.types import Facts, JitArray, SceneLike
 
 if TYPE_CHECKING:
@@ -61,6 +63,7 @@ def realtime(
     order: int | None = None,
     window: str | None = None,
     transfer: TransferSettings | None = None,
+    shadows: bool | None = None,
     count_fetches: bool = False,
 ) -> RenderResult:
     """Render a scene with OpenGL.
@@ -87,6 +90,10 @@ def realtime(
         That damps their ringing.
     transfer : btfref.rendering.environment_light.transfer.TransferSettings, optional
         Of the way "transfer".
+    shadows : bool, optional
+        Shadows that shapes cast under delta lights. By default where a shape can be in the way
+        (:func:`btfref.scene.occluders.has_occluders`) and the scene has no environment, whose light casts none but by the
+        way "transfer".
     count_fetches : bool
         Count the texels that the representations fetch: ``meta["fetches"]``, the mean over covered samples.
 
@@ -97,7 +104,8 @@ def realtime(
         ``meta["mirrored"]`` names the shapes whose texture is mirrored; ``meta["frame_ms"]`` is the median time of one
         frame (one sample a pixel), GPU timer and wall clock whichever is longer; ``gl_vendor``, ``gl_renderer``,
         ``gl_version``; ``negative_fraction``, the share of channels below zero, and ``not_finite``, their number:
-        nothing is clamped; ``kept``, how many maps were kept by file. With an environment ``environment_path``, the way
+        nothing is clamped; ``kept``, how many maps were kept by file; ``shadows``, and with them ``shadow_maps``, the
+        number of maps, and ``shadow_ms``, the time to draw them, once for all frames. With an environment ``environment_path``, the way
         taken, and what it says of itself, such as ``environment_lights`` and their ``estimated_error``; by file where
         there are several.
 
@@ -124,7 +132,10 @@ def realtime(
 
     lighting = lighting_of(scene, environment, lights=lights, order=order, window=window, transfer=transfer)
     load_file = load_needed if needed else None
-    with Renderer(scene, load_file, lighting=lighting, count_fetches=count_fetches) as renderer:
+    if shadows is None:
+        shadows = bool(scene.lights) and scene.environment is None and has_occluders(scene)
+    given: dict[str, Any] = {"lighting": lighting, "shadows": shadows, "count_fetches": count_fetches}
+    with Renderer(scene, load_file, **given) as renderer:
         offsets = [((i + 0.5) / grid, (j + 0.5) / grid) for j in range(grid) for i in range(grid)]
         total = np.zeros((scene.camera.height, scene.camera.width, 3))
         times, fetches = [], []
@@ -137,7 +148,8 @@ def realtime(
         meta = {
             "renderer": "realtime",
             "grid": grid,
-            "shadows": False,
+            "shadows": shadows,
+            **renderer.shadow_facts,
             "frame_ms": float(np.median(times)),
             "negative_fraction": float((image < 0).mean()),
             "not_finite": int((~np.isfinite(image)).sum()),
@@ -170,6 +182,8 @@ class Renderer:
         ``path -> Representation``; the default reads the files.
     lighting : btfref.rendering.environment_light.lighting.Lighting, optional
         Of the scene's environment; default: "auto".
+    shadows : bool
+        Cast by shapes, under delta lights.
     count_fetches : bool
         Have :meth:`fetches` tell the texels fetched; a little slower.
     """
@@ -180,6 +194,7 @@ class Renderer:
         load_file: LoadFile | None = None,
         *,
         lighting: Lighting | None = None,
+        shadows: bool = False,
         count_fetches: bool = False,
     ) -> None:
         if not scene.lights and scene.environment is None:
@@ -203,6 +218,7 @@ class Renderer:
         self._target = self._own(self.ctx.framebuffer([colour], self._own(self.ctx.depth_renderbuffer(size))))
         self._near, self._far = clip_planes(self.camera, scene.meshes)
         self._lights = light_uniforms(scene.lights) if scene.lights else {}
+        self._shadows = self._own(ShadowMaps(self.ctx, scene)) if shadows and scene.lights else None
         self._n_lights, self._lighting = len(scene.lights), lighting
         if lighting is None:
             self._lighting = lighting_of(scene)
@@ -241,6 +257,8 @@ class Renderer:
                 self.ctx, rep, filter_type=material.filter_type, light=light
             )
             defines = {"N_LIGHTS": self._n_lights, **self._counting}
+            if self._shadows is not None:
+                defines |= self._shadows.defines
             by_pixel = light is not None and len(light.passes) > 1 and light.bins is None
             if by_pixel:
                 defines["SEEN"] = 1
@@ -311,6 +329,7 @@ class Renderer:
             "film_offset": np.asarray(offset, float) - 0.5,
             "film_height": float(camera.height),
             **self._lights,
+            **(self._shadows.uniforms if self._shadows is not None else {}),
         }
         ctx.finish()
         start = time.perf_counter()
@@ -323,6 +342,8 @@ class Renderer:
             for index, (mesh, key, table) in enumerate(self._meshes):
                 shown, program, vertices, light = self._shown[key]
                 tables, by_pixel = {**shown.textures, "triangles": table}, "seen" in program
+                if self._shadows is not None:
+                    tables |= self._shadows.textures
                 if by_pixel:
                     tables["seen"] = self._what_is_seen()[0]
                     ctx.depth_func, self._target.depth_mask = ">", False
@@ -349,6 +370,14 @@ class Renderer:
         """What can be lit anew, one :class:`btfref.rendering.environment_light.transfer_light.TransferLight` a mesh."""
         lights = [light for *_, light in self._shown.values()]
         return [light.transfer for light in lights if light is not None and light.transfer is not None]
+
+    @property
+    def shadow_facts(self) -> Facts:
+        """Number of the shadow maps and milliseconds to draw them, with shadows."""
+        maps = self._shadows
+        if maps is None:
+            return {}
+        return {"shadow_maps": maps.defines.get("SHADOW_VIEWS", 0), "shadow_ms": maps.milliseconds}
 
     @property
     def environment_facts(self) -> Facts:
