@@ -77,7 +77,8 @@ class PixelClass(IntEnum):
 
     *Interior* pixels see one smooth surface, *edge* pixels an edge of it or are beside one, *silhouette* pixels have a
     sample so near to an edge that renderers may see different sides of it, *mesostructure* pixels see an edge inside a
-    material that has a geometry of its own, *background* pixels nothing.
+    material that has a geometry of its own, *shadow border* pixels have a sample near to the border of a shadow that a shape
+    casts, *background* pixels nothing.
     """
 
     BACKGROUND = 0
@@ -85,6 +86,7 @@ class PixelClass(IntEnum):
     SILHOUETTE = 2
     MESOSTRUCTURE = 3
     EDGE = 4
+    SHADOW_BORDER = 5
 
     @property
     def label(self) -> str:

@@ -8,6 +8,7 @@ casts shadows; one with a position has one as well where that fits a cone, and t
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,11 +27,15 @@ if TYPE_CHECKING:
     from btfref.scene.shapes import MeshDescription
 
 
-#: Side of a tile, and of all tiles together at most, in texels.
-TILE, ATLAS = 2048, 8192
+#: Texels along a tile for each pixel along the picture, and at least and at most: where both show the same, what hides
+#: between texels is narrower than the border of a shadow in :mod:`btfref.scene.shadow_borders`.
+PER_PIXEL, LEAST, MOST = 8, 1024, 4096
 
-#: Texels around what a tile shows: lookups read the neighbours.
-BORDER = 4
+#: Side of all tiles together at most, in texels.
+ATLAS = 8192
+
+#: Share of a tile's side that is left free at each border, four texels of the smallest: lookups read the neighbours.
+RIM = 4 / LEAST
 
 #: Tangent of half the angle of the widest cone that one tile shows: 60°, where a texel at the rim sees a quarter of the
 #: angle that one in the middle sees.
@@ -96,8 +101,9 @@ class ShadowMaps:
             draws += [[spans[chosen.index(number)] for number in numbers]] * (len(views) - first)
             ranges.append((first, len(views), 0, 0))
         limit = min(ctx.info["GL_MAX_TEXTURE_SIZE"], ATLAS)
-        columns = int(np.ceil(len(views) ** 0.5))
-        size = min(TILE, limit // columns)
+        columns = math.ceil(len(views) ** 0.5)
+        wanted = 2 ** math.ceil(math.log2(PER_PIXEL * max(scene.camera.width, scene.camera.height)))
+        size = min(max(wanted, LEAST), MOST, limit // columns)
         corners = [(size * (k % columns), size * (k // columns)) for k in range(len(views))]
         self.defines = {"SHADOWS": 1, "SHADOW_VIEWS": len(views)}
         self.uniforms = {
@@ -244,7 +250,7 @@ def _from(position: np.ndarray, frame: np.ndarray) -> np.ndarray:
 def _fitted(matrix: np.ndarray, low: np.ndarray, high: np.ndarray) -> View:
     """The view of ``matrix`` whose x, y and depth between ``low`` and ``high`` fill the tile up to its border."""
     size = np.maximum(high - low, 1e-6 * max(1e-30, float((high - low).max())))
-    inner = 1 - 2 * BORDER / TILE
+    inner = 1 - 2 * RIM
     scale, centre = 2 * inner / size[:2], 0.5 * (low + high)[:2]
     made = matrix.copy()
     made[:2] = scale[:, None] * (matrix[:2] - centre[:, None] * matrix[3])
