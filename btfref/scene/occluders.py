@@ -32,7 +32,8 @@ def in_one_plane(points: np.ndarray) -> tuple[np.ndarray, float] | None:
     Returns
     -------
     (ndarray, float) or None
-        Unit normal n and offset d with n · p = d; None where no plane holds them to rounding. Points on a line have many.
+        Unit normal n and offset d with n · p = d; None where no plane holds them to rounding. Points on a line have
+        many.
     """
     points = np.asarray(points, float).reshape(-1, 3)
     if not len(points):

@@ -70,10 +70,10 @@ def pixel_classes(
     such a sample is *silhouette*. An *edge* pixel has none, but its samples or those of its eight neighbours meet an
     edge: they mix hit and miss or several shapes, the surface jumps in depth between two of them (a fold in front of
     the cloth itself), or turns away from the view. *Mesostructure* are other pixels in which a material with a
-    geometry of its own (a g-BRDF) jumps within `HIT` of a sample, under one of the scene's delta lights; *shadow border*
-    those, in a picture with cast shadows, in which the border of one is near to a sample
-    (:func:`btfref.scene.shadow_borders.shadow_borders`). All other pixels that are hit are *interior*, be they lit or in
-    shadow.
+    geometry of its own (a g-BRDF) jumps within `HIT` of a sample, under one of the scene's delta lights; *shadow
+    border* those, in a picture with cast shadows, in which the border of one is near to a sample
+    (:func:`btfref.scene.shadow_borders.shadow_borders`). All other pixels that are hit are *interior*, be they lit or
+    in shadow.
 
     Parameters
     ----------

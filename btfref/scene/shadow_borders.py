@@ -21,7 +21,8 @@ COARSE = 1.0
 STEP = 0.25
 
 #: Cosine between a light and a triangle's plane below which not the shape decides, but where the shadow ray starts: it
-#: does so 1e-4 of the coordinates beside the surface, as far as triangles of a tenth are then thick, seen from the light.
+#: does so 1e-4 of the coordinates beside the surface, which is what triangles of a tenth measure then, seen from the
+#: light.
 EDGE_ON = 1e-3
 
 
@@ -30,7 +31,8 @@ def shadow_borders(scene: JitArray, grid: int, near: float = NEAR) -> np.ndarray
 
     A shadow ray towards every delta light is traced from each sample's point, as the reference does it, and from four
     points of the same surface beside it, ``near`` pixels away along both axes of the picture. Where they disagree, the
-    border of a shadow is near; so it is where the light sees the triangle edge-on. Lights below the horizon of the shading normal do not count.
+    border of a shadow is near; so it is where the light sees the triangle edge-on. Lights below the horizon of the
+    shading normal do not count.
 
     Parameters
     ----------

@@ -92,8 +92,8 @@ def realtime(
         Of the way "transfer".
     shadows : bool, optional
         Shadows that shapes cast under delta lights. By default where a shape can be in the way
-        (:func:`btfref.scene.occluders.has_occluders`) and the scene has no environment, whose light casts none but by the
-        way "transfer".
+        (:func:`btfref.scene.occluders.has_occluders`) and the scene has no environment, whose light casts none but by
+        the way "transfer".
     count_fetches : bool
         Count the texels that the representations fetch: ``meta["fetches"]``, the mean over covered samples.
 
@@ -104,10 +104,10 @@ def realtime(
         ``meta["mirrored"]`` names the shapes whose texture is mirrored; ``meta["frame_ms"]`` is the median time of one
         frame (one sample a pixel), GPU timer and wall clock whichever is longer; ``gl_vendor``, ``gl_renderer``,
         ``gl_version``; ``negative_fraction``, the share of channels below zero, and ``not_finite``, their number:
-        nothing is clamped; ``kept``, how many maps were kept by file; ``shadows``, and with them ``shadow_maps``, the
-        number of maps, and ``shadow_ms``, the time to draw them, once for all frames. With an environment ``environment_path``, the way
-        taken, and what it says of itself, such as ``environment_lights`` and their ``estimated_error``; by file where
-        there are several.
+        nothing is clamped; ``kept``, how many maps were kept by file; ``shadows``, and with them
+        ``shadow_maps``, the number of maps, and ``shadow_ms``, the time to draw them, once for all frames. With an
+        environment ``environment_path``, the way taken, and what it says of itself, such as ``environment_lights`` and
+        their ``estimated_error``; by file where there are several.
 
     Raises
     ------

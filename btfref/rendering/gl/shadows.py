@@ -1,9 +1,9 @@
 """Shadow maps of delta lights: the triangle that is nearest to a light, in tiles of one texture.
 
-The map holds no depths (Williams 1978) but triangles, and ``shaders/lib/light/shadows.glsl`` meets them with the shadow ray
-itself: the map only finds candidates. What is wholly lit or wholly in shadow is then as a ray tracer has it, without a
-bias, and the border of a shadow is as sharp as the picture's samples. A light with a direction has one tile around what
-casts shadows; one with a position has one as well where that fits a cone, and the six of a cube otherwise.
+The map holds no depths (Williams 1978) but triangles, and ``shaders/lib/light/shadows.glsl`` meets them with the shadow
+ray itself: the map only finds candidates. What is wholly lit or wholly in shadow is then as a ray tracer has it,
+without a bias, and the border of a shadow is as sharp as the picture's samples. A light with a direction has one tile
+around what casts shadows; one with a position has one as well where that fits a cone, and the six of a cube otherwise.
 """
 
 from __future__ import annotations
