@@ -144,7 +144,7 @@ FAULTS = (
         "a shape lets the light through",
         NOISE_FREE,
         "shadows",
-        edit=("lib/light/shadows.glsl", "if (inside && met.w > 0.0", "if (inside && met.w > 0.5"),
+        edit=("lib/light/shadows.glsl", "if (inside && met.w > 0.0", "if (inside && met.w > 9.0"),
     ),
     Fault(
         "shadows fall a fiftieth of the scene off",
