@@ -57,6 +57,13 @@ def test_a_floor_casts_no_shadow():
 )
 def test_both_renderers_know_whether_a_scene_has_occluders(llvm, shapes, expected):
     llvm.set_variant("scalar_rgb")
+    turned = llvm.ScalarTransform4f().translate([1, 2, 3]).rotate([1, 2, -1], 40)
+    # The second one beside the first.
+    places = (turned, turned @ llvm.ScalarTransform4f().translate([3, -1, 0]))
+    shapes = {
+        name: {**shape, "to_world": place}
+        for (name, shape), place in zip(shapes.items(), places, strict=False)
+    }
     sun = {"sun": {"type": "directional", "direction": [0, 0.3, -1]}}
     scene = {"type": "scene", "sensor": {"type": "perspective"}, **shapes, **sun}
     assert has_occluders(read_scene(scene)) == expected
