@@ -10,7 +10,7 @@ from btfref.conventions import PixelClass
 from btfref.scene.camera import film_rays, grid_offsets
 from btfref.scene.lights import is_delta
 from btfref.scene.loading import loaded
-from btfref.scene.shadow_borders import COARSE, NEAR, shadow_borders
+from btfref.scene.shadows.borders import COARSE, NEAR, shadow_borders
 from btfref.types import JitArray, SceneLike
 
 #: A step between neighbouring samples that leaves the tangent plane by more than this share of a pixel's
@@ -72,7 +72,7 @@ def pixel_classes(
     the cloth itself), or turns away from the view. *Mesostructure* are other pixels in which a material with a
     geometry of its own (a g-BRDF) jumps within `HIT` of a sample, under one of the scene's delta lights; *shadow
     border* those, in a picture with cast shadows, in which the border of one is near to a sample
-    (:func:`btfref.scene.shadow_borders.shadow_borders`). All other pixels that are hit are *interior*, be they lit or
+    (:func:`btfref.scene.shadows.borders.shadow_borders`). All other pixels that are hit are *interior*, be they lit or
     in shadow.
 
     Parameters

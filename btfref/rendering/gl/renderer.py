@@ -30,7 +30,7 @@ from btfref.rendering.gl.shadows import ShadowMaps
 from btfref.scene.demand import MARGIN, kept_maps, number_kept
 from btfref.scene.description import SceneDescription, read_scene
 from btfref.scene.mirrored import mirrored_meshes
-from btfref.scene.occluders import has_occluders
+from btfref.scene.shadows.occluders import has_occluders
 from btfref.types import Facts, JitArray, SceneLike
 
 if TYPE_CHECKING:
@@ -92,8 +92,8 @@ def realtime(
         Of the way "transfer".
     shadows : bool, optional
         Shadows that shapes cast under delta lights. By default where a shape can be in the way
-        (:func:`btfref.scene.occluders.has_occluders`) and the scene has no environment, whose light casts none but by
-        the way "transfer".
+        (:func:`btfref.scene.shadows.occluders.has_occluders`) and the scene has no environment, whose light casts none
+        but by the way "transfer".
     count_fetches : bool
         Count the texels that the representations fetch: ``meta["fetches"]``, the mean over covered samples.
 

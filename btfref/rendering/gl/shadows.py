@@ -18,7 +18,7 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.rendering.gl import device
-from btfref.scene.occluders import casters
+from btfref.scene.shadows.occluders import casters
 from btfref.scene.shapes import neighbours
 from btfref.types import JitArray
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 #: Texels along a tile for each pixel along the picture, and at least and at most: where both show the same, what hides
-#: between texels is narrower than the border of a shadow in :mod:`btfref.scene.shadow_borders`.
+#: between texels is narrower than the border of a shadow in :mod:`btfref.scene.shadows.borders`.
 PER_PIXEL, LEAST, MOST = 8, 1024, 4096
 
 #: Side of all tiles together at most, in texels.

@@ -16,7 +16,7 @@ from btfref.scene.camera import tell_camera
 from btfref.scene.demand import MARGIN, kept_maps, number_kept
 from btfref.scene.loading import loaded
 from btfref.scene.mirrored import seen_mirrored
-from btfref.scene.occluders import casts_shadows
+from btfref.scene.shadows.occluders import casts_shadows
 from btfref.types import Facts, JitArray, SceneLike
 
 #: Independent renders whose spread gives the variance of the mean: 15 degrees of freedom.
@@ -62,7 +62,8 @@ def render(
     shadows : bool, optional
         False leaves cast shadows out: direct light of delta lights and an environment, whatever the scene's integrator.
         By default they are there. ``meta["shadows"]`` then says whether any shape can be in the way
-        (:func:`btfref.scene.occluders.casts_shadows`): on a grid nothing is traced towards the lights where none can.
+        (:func:`btfref.scene.shadows.occluders.casts_shadows`): on a grid nothing is traced towards the lights where
+        none can.
     size : (int, int), optional
         Width and height in place of the scene's.
     with_variance : bool

@@ -8,8 +8,8 @@ from btfref.gates import tolerance
 from btfref.rendering.gl.shadows import light_views, occluder_table
 from btfref.scene.description import Light, MeshDescription, read_scene
 from btfref.scene.loading import loaded
-from btfref.scene.occluders import casters, casts_shadows, has_occluders, in_one_plane
 from btfref.scene.pixel_classes import pixel_classes
+from btfref.scene.shadows.occluders import casters, casts_shadows, has_occluders, in_one_plane
 
 SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
 
