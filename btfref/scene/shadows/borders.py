@@ -81,12 +81,12 @@ def shadow_borders(scene: JitArray, grid: int, near: float = NEAR) -> np.ndarray
 
 
 def _reaches(scene: JitArray, light: JitArray, si: JitArray) -> tuple[JitArray, JitArray, JitArray]:
-    """Whether a light is above the horizon of surface interactions, reaches them, and sees their triangles edge-on."""
+    """Whether a light shines above the horizon of surface interactions, reaches them, sees their triangles edge-on."""
     import drjit as dr
     import mitsuba as mi
 
-    sample, _ = light.sample_direction(si, mi.Point2f(0.5), si.is_valid())
-    matters = si.is_valid() & (sample.pdf > 0)
+    sample, power = light.sample_direction(si, mi.Point2f(0.5), si.is_valid())
+    matters = si.is_valid() & (sample.pdf > 0) & (dr.max(mi.Color3f(power)) > 0)
     matters &= (si.to_local(sample.d).z * si.wi.z > 0) | mi.has_flag(
         si.bsdf().flags(), mi.BSDFFlags.Transmission
     )
