@@ -86,7 +86,7 @@ def _reaches(scene: JitArray, light: JitArray, si: JitArray) -> tuple[JitArray, 
     import mitsuba as mi
 
     sample, power = light.sample_direction(si, mi.Point2f(0.5), si.is_valid())
-    matters = si.is_valid() & (sample.pdf > 0) & (dr.max(mi.Color3f(power)) > 0)
+    matters = si.is_valid() & (sample.pdf > 0) & (dr.max(power) > 0)
     matters &= (si.to_local(sample.d).z * si.wi.z > 0) | mi.has_flag(
         si.bsdf().flags(), mi.BSDFFlags.Transmission
     )
