@@ -47,7 +47,7 @@ def judge_pictures(key: str, comparison: Comparison, masks: Mapping[str, np.ndar
         raise InputError("unknown pixel class", file="tolerances.toml", field=f"{key}.class", got=name)
     mask = np.any([masks[one] for one in names if one in masks], axis=0)
     # Materials that real time shows otherwise are left out of what is judged.
-    covered = ~np.isin(comparison.classes, (PixelClass.BACKGROUND, PixelClass.OTHER))
+    covered = ~np.isin(np.asarray(comparison.classes), (PixelClass.BACKGROUND, PixelClass.OTHER))
     share = int(np.count_nonzero(mask & covered)) / max(int(np.count_nonzero(covered)), 1)
     if wanted == ["judged_share"]:
         # Edges inside a material and borders of shadows have classes and gates of their own.

@@ -26,6 +26,7 @@ from btfref.types import JitArray
 if TYPE_CHECKING:
     from btfref.scene.reading.instances import Drawn
     from btfref.scene.shapes import BtfMaterial, MeshDescription
+    from btfref.scene.surfaces.materials import PlainMaterial
 
 #: Shapes whose triangles are a tessellation of ours.
 ANALYTIC = ("sphere", "disk", "cylinder")
@@ -114,7 +115,7 @@ class Hits:
 
     def __init__(
         self,
-        material: BtfMaterial,
+        material: BtfMaterial | PlainMaterial,
         uv: JitArray,
         wi: JitArray,
         hand: JitArray,
@@ -126,7 +127,7 @@ class Hits:
         self._surface, self._at = surface, at
 
     @classmethod
-    def of(cls, surface: Surface, material: BtfMaterial, at: np.ndarray) -> Hits:
+    def of(cls, surface: Surface, material: BtfMaterial | PlainMaterial, at: np.ndarray) -> Hits:
         """Those of the pixels ``at`` of a surface, shape (N,) int."""
         return cls(material, surface["uv"][at], surface["wi"][at], surface.hand[at], surface=surface, at=at)
 

@@ -259,7 +259,8 @@ class Renderer:
         what = material if isinstance(material, PlainMaterial) else material.filename
         key = (what, material.filter_type, own, exact)
         if key not in self._shown:
-            rep = what if isinstance(what, PlainMaterial) else load_file(what)
+            # A plain material is drawn as a representation is.
+            rep: Any = what if isinstance(what, PlainMaterial) else load_file(what)
             light = None
             if lighting is not None:
                 file = what if isinstance(what, str) else None

@@ -83,6 +83,8 @@ def approximate(
     start, camera = time.perf_counter(), description.camera
     reps, prepared, total = {}, {}, np.zeros((camera.height * camera.width, 3))
     wanted = np.full(len(total), True) if pixels is None else np.ravel(pixels)
+    # A plain material is evaluated as a representation is.
+    rep: Any
     with loaded(scene, parameters, size=size, sampled=False) as made:
         shapes = drawn_shapes(made, [mesh.where for mesh in description.meshes])
         for surface in surfaces(made, grid):
@@ -94,7 +96,7 @@ def approximate(
                 if not len(hits.at):
                     continue
                 if mesh.material is None:
-                    rep, light = mesh.plain, None
+                    rep, light = mesh.shown, None
                     if lighting is not None:
                         light = lighting.of_plain.prepared(rep)
                     total[hits.at] += _radiance(rep, hits, mesh, description, grid, light)

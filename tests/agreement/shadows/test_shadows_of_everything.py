@@ -64,7 +64,7 @@ def everything(mi, path):
             "type": "cylinder",
             "p0": [-0.9, -0.7, 0],
             "p1": [-0.8, -0.7, 0.9],
-            "radius": 0.06,
+            "radius": 0.1,
             "bsdf": both,
         },
         "sign": {
