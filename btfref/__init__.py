@@ -4,7 +4,7 @@
 >>> btf = btfref.synthesize("checker", texels=64, views="ubo81", lights="ubo81", spp=16)
 >>> lpca = btfref.fit("lpca", btf, clusters=16, components=4)
 >>> btfref.save(lpca, "checker.lpca.exr")
->>> reference = btfref.render("plane", parameters={"btf": "checker.lpca.exr"}, grid=4, shadows=False)
+>>> reference = btfref.render("plane", parameters={"btf": "checker.lpca.exr"}, grid=4)
 >>> image = btfref.realtime("plane", parameters={"btf": "checker.lpca.exr"}, grid=4)
 >>> btfref.compare(image, reference, gate="image.noise_free").passed
 True

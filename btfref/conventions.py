@@ -77,8 +77,8 @@ class PixelClass(IntEnum):
 
     *Interior* pixels see one smooth surface, *edge* pixels an edge of it or are beside one, *silhouette* pixels have a
     sample so near to an edge that renderers may see different sides of it, *mesostructure* pixels see an edge inside a
-    material that has a geometry of its own, *other* pixels a material that real time shows as its mean albedo,
-    *background* pixels nothing.
+    material that has a geometry of its own, *shadow border* pixels have a sample near to the border of a shadow that a
+    shape casts, *other* pixels see a material that real time shows as its mean albedo, *background* pixels nothing.
     """
 
     BACKGROUND = 0
@@ -86,7 +86,8 @@ class PixelClass(IntEnum):
     SILHOUETTE = 2
     MESOSTRUCTURE = 3
     EDGE = 4
-    OTHER = 5
+    SHADOW_BORDER = 5
+    OTHER = 6
 
     @property
     def label(self) -> str:

@@ -211,7 +211,7 @@ class _Chain:
         reference = self.reference(method, scene, lights)
         path, parameters = self.arguments(method, scene, lights)
         with self.timed("real time"):
-            image = realtime(path, parameters=parameters, grid=GRID)
+            image = realtime(path, parameters=parameters, grid=GRID, shadows=False)
         self.renderers["real time"] = image.meta
         images = {"reference": reference.image, "realtime": image.image}
         if scene == FLAT:

@@ -36,7 +36,7 @@ def assert_matches_reference(
     btf: PathLike | None = None,
     size: tuple[int, int] | None = None,
     grid: int = 4,
-    shadows: bool = False,
+    shadows: bool | None = None,
     gates: str | Sequence[str] | None = None,
     cache: PathLike | None = None,
     report: PathLike | None = None,
@@ -56,8 +56,8 @@ def assert_matches_reference(
         Width and height in place of the scene's; by default the picture's own.
     grid : int
         n of the n × n sub-pixel samples, at (i + ½)/n, box filter: what the renderer under test should do.
-    shadows : bool
-        Whether the renderer casts shadows.
+    shadows : bool, optional
+        Whether the renderer casts shadows; by default as the picture's file says, and no where it says nothing.
     gates : str or sequence of str, optional
         Keys of ``tolerances.toml`` in place of the usual ones.
     cache : path-like, optional
@@ -80,12 +80,16 @@ def assert_matches_reference(
     import numpy as np
 
     from btfref.images import load_image
+    from btfref.rendering.picture import read_picture_facts
     from btfref.validate.own_renderer import judge_image, reference_of
 
     __tracebackhide__ = True
     if size is None:
         shape = (np.asarray(image) if isinstance(image, np.ndarray) else load_image(image)).shape
         size = (int(shape[1]), int(shape[0]))
+    if shadows is None:
+        facts = None if isinstance(image, np.ndarray) else read_picture_facts(image)
+        shadows = bool((facts or {}).get("shadows"))
     values = {key: str(value) for key, value in parameters.items()}
     if btf is not None:
         values["btf"] = str(btf)

@@ -17,7 +17,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from btfref.commands.shared.images import load_classes
-from btfref.commands.shared.options import add_define, add_grid, add_json, add_overwrite, add_size
+from btfref.commands.shared.options import (
+    add_define,
+    add_grid,
+    add_json,
+    add_overwrite,
+    add_shadows,
+    add_size,
+)
 from btfref.commands.shared.printing import GATE_HEADER, emit, emit_json, gate_cells, number, table
 from btfref.commands.shared.reading import assignments, output_file
 from btfref.errors import InputError
@@ -44,7 +51,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     add_define(scene)
     add_size(scene, "of the film, in pixels (default: the picture's)")
     add_grid(scene)
-    scene.add_argument("--shadows", action="store_true", help="the picture has cast shadows")
+    add_shadows(scene, "of the reference (default: as the picture's file says, or none)")
     scene.add_argument("--cache", metavar="FOLDER", help="of references (default: the user's cache)")
     add_json(parser, "metrics and gates")
     add_overwrite(parser)
@@ -97,6 +104,7 @@ def run(args: Namespace) -> int:
 
 def _against_scene(args: Namespace, test: np.ndarray) -> tuple[Comparison, Facts]:
     """The comparison with the reference of a scene, and what that shows."""
+    from btfref.rendering.picture import read_picture_facts
     from btfref.scene.facts import scene_content
     from btfref.validate.own_renderer import judge_image, reference_of, representation_for
 
@@ -106,12 +114,15 @@ def _against_scene(args: Namespace, test: np.ndarray) -> tuple[Comparison, Facts
     if args.method:
         parameters["btf"] = str(representation_for(args.method, args.btf, cache=args.cache))
     size = args.size or (test.shape[1], test.shape[0])
+    shadows = args.shadows
+    if shadows is None:
+        shadows = bool((read_picture_facts(args.test) or {}).get("shadows"))
     found = reference_of(
         args.reference,
         parameters=parameters,
         size=size,
         grid=args.grid,
-        shadows=args.shadows,
+        shadows=shadows,
         cache=args.cache,
     )
     # Under an environment the reference is a plain rendering of the scene.
@@ -119,7 +130,7 @@ def _against_scene(args: Namespace, test: np.ndarray) -> tuple[Comparison, Facts
     facts = {
         **scene_content(args.reference, parameters, size=size),
         "grid": None if noisy else args.grid,
-        "shadows": noisy or args.shadows,
+        "shadows": noisy or shadows,
     }
     return judge_image(args.test, found, gates=args.gate), facts
 

@@ -1,8 +1,13 @@
 """Render a Mitsuba scene with OpenGL: the real-time image.
 
 Meshes, spheres, disks and cylinders with BTFs or other materials (diffuse exactly, the rest as their mean albedo), a
-perspective camera, directional, point, spot and area lights, and an envmap, sunsky or constant emitter. No cast
-shadows: compare with `btfref render --no-shadows`. The image is the mean of a regular sub-pixel grid (--grid).
+perspective camera, directional, point, spot and area lights, and an envmap, sunsky or constant emitter. The image is
+the mean of a regular sub-pixel grid (--grid).
+
+All lights but environments cast shadows, as in `btfref render --grid`, where a shape can be in the way: always, unless
+all shapes lie in one plane. A scene with an environment is drawn without, since an environment's light casts none here
+(but by the way "transfer"). --shadows and --no-shadows decide otherwise; compare a picture without with `btfref render
+--no-shadows`.
 
 --environment says how an envmap lights: "prefiltered" maps, for the methods that have them, "lights", directional
 lights that stand for it, for any method, or "auto", the first of these that there is; "sh", spherical harmonics, for
@@ -22,6 +27,7 @@ from btfref.commands.shared.options import (
     add_json,
     add_keep,
     add_scene,
+    add_shadows,
     help_with_scenes,
 )
 from btfref.commands.shared.printing import emit, emit_json, say_area_lights
@@ -42,6 +48,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     add_image(parser)
     add_grid(parser)
     add_keep(parser)
+    add_shadows(parser, "of points and directions (default: where shapes do not all lie in one plane)")
     parser.add_argument(
         "--environment", choices=PATHS, default="auto", help="how an envmap lights (default auto)"
     )
@@ -106,6 +113,7 @@ def run(args: Namespace) -> int:
         order=args.order,
         window=args.window,
         transfer=transfer_settings(args.transfer) if args.transfer else None,
+        shadows=args.shadows,
     )
     facts = picture_facts(result, args.scene, parameters=parameters, size=args.size)
     write_images(result.image, out, facts, png=args.png)

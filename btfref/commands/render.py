@@ -18,6 +18,7 @@ from btfref.commands.shared.options import (
     add_keep,
     add_scene,
     add_seed,
+    add_shadows,
     help_with_scenes,
 )
 from btfref.commands.shared.printing import emit, say_area_lights
@@ -38,7 +39,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     add_seed(parser)
     parser.add_argument("--variant", default="llvm_ad_rgb", metavar="NAME", help="Mitsuba variant")
     add_grid(parser, default=None, text="direct light on a regular grid of N × N sub-pixels")
-    parser.add_argument("--no-shadows", action="store_true", help="direct light without cast shadows")
+    add_shadows(parser, "cast shadows, or direct light without (default: with)")
     add_keep(parser)
     parser.add_argument("--debug", action="store_true", help="a channel that is no number is an error")
     parser.add_argument("--geometry", action="store_true", help="path trace the mesostructure itself")
@@ -75,7 +76,7 @@ def run(args: Namespace) -> int:
             seed=args.seed,
             size=args.size,
             grid=args.grid,
-            shadows=not args.no_shadows,
+            shadows=args.shadows,
             keep=args.keep,
             debug=args.debug,
         )
@@ -90,7 +91,9 @@ def run(args: Namespace) -> int:
     if classes_out:
         from btfref.scene.pixel_classes import pixel_classes
 
-        classes = pixel_classes(args.scene, parameters=parameters, size=args.size, grid=args.grid or 4)
+        shadows = bool(result.meta.get("shadows"))
+        shared = {"parameters": parameters, "size": args.size, "grid": args.grid or 4}
+        classes = pixel_classes(args.scene, shadows=shadows, **shared)
     facts = picture_facts(result, args.scene, parameters=parameters, size=args.size)
     write_images(result.image, out, facts, png=args.png, classes=classes, classes_out=classes_out)
     return 0

@@ -140,8 +140,8 @@ def compare(
     test, reference : path-like, (H, W, 3) array, or an object with ``image`` and perhaps ``variance``
         Linear Rec. 709. Paths are read by `load_image`.
     classes : (H, W) integer array, optional
-        Codes of `PixelClass`: 0 background, 1 interior, 2 silhouette, 3 mesostructure, 4 edge, 5 other. Without it
-        every pixel counts as interior: nothing is excused.
+        Codes of `PixelClass`: 0 background, 1 interior, 2 silhouette, 3 mesostructure, 4 edge, 5 shadow border, 6
+        other. Without it every pixel counts as interior: nothing is excused.
     gate : str or sequence of str, optional
         Keys of ``tolerances.toml``; ``image.finite`` is always applied.
     variance : (H, W, 3) array or pair of such, optional

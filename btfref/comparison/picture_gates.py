@@ -50,8 +50,9 @@ def judge_pictures(key: str, comparison: Comparison, masks: Mapping[str, np.ndar
     covered = (comparison.classes != PixelClass.BACKGROUND) & (comparison.classes != PixelClass.OTHER)
     share = int(np.count_nonzero(mask & covered)) / max(int(np.count_nonzero(covered)), 1)
     if wanted == ["judged_share"]:
-        # Edges inside a material have a class and a gate of their own.
+        # Edges inside a material and borders of shadows have classes and gates of their own.
         smooth = covered & (comparison.classes != PixelClass.MESOSTRUCTURE)
+        smooth &= comparison.classes != PixelClass.SHADOW_BORDER
         share = int(np.count_nonzero(mask & smooth)) / max(int(np.count_nonzero(smooth)), 1)
         return judge(key, {"judged_share": share}, pixel_class=name)
     if wanted == ["nonfinite"]:

@@ -11,6 +11,7 @@ from btfref.scene.camera import film_rays, grid_offsets
 from btfref.scene.emitters.lights import is_delta
 from btfref.scene.loading import loaded
 from btfref.scene.reading.instances import every_shape
+from btfref.scene.shadows.borders import COARSE, NEAR, shadow_borders
 from btfref.scene.surfaces.materials import is_exact
 from btfref.types import JitArray, SceneLike
 
@@ -64,6 +65,7 @@ def pixel_classes(
     grid: int = 4,
     variant: str = "llvm_ad_rgb",
     follows_rays: bool = True,
+    shadows: bool = False,
 ) -> np.ndarray:
     """Class of every pixel, from the primary hits of a regular sub-pixel grid.
 
@@ -75,9 +77,10 @@ def pixel_classes(
     its samples or those of its eight neighbours meet an edge: they mix hit and miss or several shapes, the surface
     jumps in depth between two of them (a fold in front of the cloth itself), or turns away from the view.
     *Mesostructure* are other pixels in which a material with a geometry of its own (a g-BRDF) jumps within `HIT` of a
-    sample, under one of the scene's delta lights. All other pixels that are hit are *interior*. *Other* is every pixel
-    with a sample that sees a material of which real time shows the mean albedo
-    (:mod:`btfref.scene.surfaces.materials`).
+    sample, under one of the scene's delta lights; *shadow border* those, in a picture with cast shadows, in which the
+    border of one is near to a sample (:func:`btfref.scene.shadows.borders.shadow_borders`). All other pixels that are
+    hit are *interior*, be they lit or in shadow. *Other* is every pixel with a sample that sees a material of which
+    real time shows the mean albedo (:mod:`btfref.scene.surfaces.materials`).
 
     Parameters
     ----------
@@ -91,7 +94,9 @@ def pixel_classes(
         A JIT variant of Mitsuba.
     follows_rays : bool
         Whether the renderer to be judged decides by rays between triangles that meet, as btfref's does. False: by its
-        rasterizer, which snaps inner edges as it does silhouettes.
+        rasterizer, which snaps inner edges as it does silhouettes; and on shadows by depths in a map.
+    shadows : bool
+        Whether the picture has cast shadows.
 
     Returns
     -------
@@ -104,6 +109,7 @@ def pixel_classes(
         )
         jumps = _displaced_edges(made, grid)
         other = _other_materials(made, grid)
+        border = shadow_borders(made, grid, NEAR if follows_rays else COARSE) if shadows else False
     hit = shape > 0
     edge = np.zeros(shape.shape, bool)
     for axis in (0, 1):
@@ -119,6 +125,7 @@ def pixel_classes(
     any_edge = _spread(np.any(edge.reshape(pixels), axis=(1, 3)))
     any_hit = hit.reshape(pixels).any((1, 3))
     seen = np.where(any_hit, np.where(any_edge, PixelClass.EDGE, PixelClass.INTERIOR), PixelClass.BACKGROUND)
+    seen = np.where(border & any_hit, PixelClass.SHADOW_BORDER, seen)
     seen = np.where(jumps & any_hit, PixelClass.MESOSTRUCTURE, seen)
     seen = np.where(np.any(ambiguous.reshape(pixels), axis=(1, 3)), PixelClass.SILHOUETTE, seen)
     return np.where(other, PixelClass.OTHER, seen).astype(np.uint8)

@@ -250,7 +250,7 @@ def _under_deltas(path: Path, spec: Spec, views: Views, settings: Settings, shar
     scene = {name: shared[name] for name in ("parameters", "size")}
     definition = approximate(path, **shared)
     reference = render(path, grid=shared["grid"], shadows=False, **scene)
-    image = realtime(path, **shared)
+    image = realtime(path, shadows=False, **shared)
     chain = [("fit", definition.image), ("port", reference.image), ("real time", image.image)]
     return [Picture(name, picture[None]) for name, picture in chain], reference, image, GATES, {}, ()
 

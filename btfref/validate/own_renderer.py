@@ -23,7 +23,10 @@ if TYPE_CHECKING:
 
 
 #: Gates of a picture of linear radiance under delta lights; of one with 8 bits; of one under an environment.
-LINEAR = ("image.noise_free", "image.silhouette", "image.mesostructure", "image.background")
+LINEAR = (
+    *("image.noise_free", "image.silhouette", "image.mesostructure"),
+    *("image.shadow_border", "image.background"),
+)
 EIGHT_BIT = ("image.eight_bit", "image.eight_bit_silhouette")
 NOISY = ("image.equivalence",)
 
@@ -125,7 +128,8 @@ def _render(
     from btfref.scene.pixel_classes import pixel_classes
 
     shared: Facts = {"parameters": parameters, "size": size}
-    made: Facts = {"classes": pixel_classes(path, grid=grid, follows_rays=False, **shared)}
+    kinds = pixel_classes(path, grid=grid, follows_rays=False, shadows=delta and shadows, **shared)
+    made: Facts = {"classes": kinds}
     if delta:
         return made | {"image": render(path, grid=grid, shadows=shadows, **shared).image}
     result = render(path, spp=spp, with_variance=True, **shared)

@@ -1,9 +1,10 @@
-// Provides the radiance towards the camera under the scene's lights and an environment, without cast shadows.
+// Provides the radiance towards the camera under the scene's lights, with cast shadows if any, and an environment.
 // Expects a representation, the tables of hosts/mesh.vert, the camera's rays, the lights and the material.
 
 #include "lib/surface/film.glsl"
 #include "lib/surface/frame.glsl"
 #include "lib/light/lights.glsl"
+#include "lib/light/shadows.glsl"
 #include "lib/surface/lod.glsl"
 #include "lib/surface/quadric.glsl"
 #include "lib/surface/triangle_table.glsl"
@@ -78,6 +79,11 @@ void main() {
         vec3 irradiance = light_incident(i, point.position, towards);
         vec3 w_light = to_local * towards;
         w_light.z *= side;
+        // Only light that would count is looked for.
+        bool counts = w_light.z > 0.0 && max(irradiance.r, max(irradiance.g, irradiance.b)) > 0.0;
+        if (counts && !light_reaches(i, point.position, point.plane_normal)) {
+            continue;
+        }
         // B holds the cosine of the light (design: conventions), nothing else is multiplied.
         sum += irradiance * btf_eval(uv, w_light, w_view, lod);
     }

@@ -72,6 +72,7 @@ STAGES = [
     ("hosts/mesh.vert", "hosts/mesh.frag"),
     ("hosts/mesh.vert", "hosts/seen.frag"),
     ("hosts/screen.vert", "hosts/depth.frag"),
+    ("hosts/shadow.vert", "hosts/shadow.frag"),
 ]
 
 #: The same on spheres, disks and cylinders.

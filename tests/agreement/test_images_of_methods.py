@@ -91,7 +91,7 @@ def reference(saved, classes_of):
 
 def assert_same_picture(reference, key, name, lights, settings):
     path, parameters, expected, classes = reference(key, name, lights, **settings)
-    image = realtime(path, parameters=parameters, **settings)
+    image = realtime(path, parameters=parameters, shadows=False, **settings)
     comparison = compare(image, expected, classes=classes, gate=GATES, flip=False)
     assert comparison.passed, [gate.line for gate in comparison.gates if not gate.passed]
     # The scene fills the picture and is lit: the gates saw something.
@@ -153,7 +153,7 @@ def test_injected_faults_are_caught_by_the_noise_free_gate(reference, tmp_path, 
 
     monkeypatch.setattr(device, "shader_file", faulty)
     path, parameters, expected, classes = reference(key, *ONE, **QUICK)
-    image = realtime(path, parameters=parameters, **QUICK)
+    image = realtime(path, parameters=parameters, shadows=False, **QUICK)
     comparison = compare(image, expected, classes=classes, gate="image.noise_free", flip=False)
     failed = {gate.name for gate in comparison.gates if not gate.passed}
     assert "image.noise_free.p999" in failed

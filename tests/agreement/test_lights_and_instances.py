@@ -74,22 +74,22 @@ def held(image, reference, scene, gate=GATES, grid=GRID, size=None):
 
 def test_two_instances_under_a_spot_and_an_area_light(write):
     scene = write(group(CLOTH), FLOOR, SPOT, LAMP)
-    image = realtime(scene, grid=GRID)
+    image = realtime(scene, grid=GRID, shadows=False)
     reference = render(scene, grid=GRID, shadows=False)
     assert reference.meta["integrator"] == "noise-free direct"
     assert image.meta["area_light_points"] == reference.meta["area_light_points"]
     assert held(image, reference, scene) == [True]
     # One of the instances mirrors its texture.
     assert image.meta["mirrored"] == ["i1/ply"]
-    image = realtime(scene, grid=1)
+    image = realtime(scene, grid=1, shadows=False)
     assert held(image, approximate(scene, grid=1), scene, ("image.float64",), grid=1) == [True]
     # Both are there, and the lamp is seen from its front.
-    without = realtime(write(FLOOR, SPOT, LAMP, name="without.xml"), grid=1).image
+    without = realtime(write(FLOOR, SPOT, LAMP, name="without.xml"), grid=1, shadows=False).image
     changed = np.abs(image.image - without).max(-1) > 0
     assert changed[:, :12].any()
     assert changed[:, -12:].any()
     assert (image.image == np.array([6, 7, 9], np.float32)).all(-1).any()
-    assert np.array_equal(realtime(scene, grid=1, keep="needed").image, image.image)
+    assert np.array_equal(realtime(scene, grid=1, keep="needed", shadows=False).image, image.image)
 
 
 def test_points_against_light_from_all_over_an_area(write, monkeypatch):
@@ -100,7 +100,7 @@ def test_points_against_light_from_all_over_an_area(write, monkeypatch):
     inside = classes == PixelClass.INTERIOR
     reference = converged(scene, inside, gate=gate, shadows=False, grid=GRID, **small)
     assert reference.meta["noise_ratio"] <= 1
-    assert held(realtime(scene, grid=GRID, **small), reference, scene, gate, **small) == [True]
+    assert held(realtime(scene, grid=GRID, shadows=False, **small), reference, scene, gate, **small) == [True]
     made = renderer.light_table
 
     def points(lights):
@@ -109,13 +109,16 @@ def test_points_against_light_from_all_over_an_area(write, monkeypatch):
         return table
 
     monkeypatch.setattr(renderer, "light_table", points)
-    assert held(realtime(scene, grid=GRID, **small), reference, scene, gate, **small)[0] is False
+    assert (
+        held(realtime(scene, grid=GRID, shadows=False, **small), reference, scene, gate, **small)[0] is False
+    )
 
 
 def test_mirrored_instances_of_shapes_with_face_normals(write):
     """A group of a box and a rectangle; the rectangle shines, but not in a group."""
     scene = write(group(BOX, '<shape type="rectangle"><ref id="m"/></shape>'), SUN)
-    assert held(realtime(scene, grid=GRID), render(scene, grid=GRID, shadows=False), scene) == [True]
+    pictures = (show(scene, grid=GRID, shadows=False) for show in (realtime, render))
+    assert held(*pictures, scene) == [True]
     assert [mesh.name for mesh in read_scene(scene).meshes] == [
         "i0/box",
         "i0/rectangle",
@@ -128,7 +131,7 @@ def test_merged_shapes_are_separate_ones(write):
     boxes = [BOX.replace("{placed}", place).replace("box", f"box{k}") for k, place in enumerate(PLACES)]
     merged = write(f'<shape type="merge">{"".join(boxes)}</shape>', SUN)
     apart = write(*boxes, SUN, name="apart.xml")
-    for image in (realtime, lambda scene, **more: render(scene, shadows=False, **more)):
+    for image in (realtime, render):
         assert np.array_equal(image(merged, grid=1).image, image(apart, grid=1).image)
 
 

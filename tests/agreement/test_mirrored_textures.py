@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("renderers")
 
 RENDERERS = {
     "plugin": lambda scene: render(scene, grid=1, shadows=False),
-    "GLSL": lambda scene: realtime(scene, grid=1),
+    "GLSL": lambda scene: realtime(scene, grid=1, shadows=False),
     "float64": lambda scene: approximate(scene, grid=1),
 }
 

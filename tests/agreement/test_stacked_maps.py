@@ -86,7 +86,7 @@ def both_pictures(mi, fitted, folder, **parameters):
     save(fitted, folder / "a.cmf.exr")
     scene = plane(mi, {"type": "btf", "filename": str(folder / "a.cmf.exr"), **parameters})
     assert (pixel_classes(scene, grid=GRID) == PixelClass.INTERIOR).all()
-    return render(scene, grid=GRID, shadows=False), realtime(scene, grid=GRID)
+    return render(scene, grid=GRID, shadows=False), realtime(scene, grid=GRID, shadows=False)
 
 
 @pytest.mark.parametrize("storage", ["half", "byte"])

@@ -59,7 +59,7 @@ def test_it_is_not_known_without_its_package():
 def test_command_line_and_both_renderers(run):
     assert json.loads(run("info", f"formula.{KEY}.exr", "--json"))["method"] == KEY
     scene = ["sphere", "-D", f"btf=formula.{KEY}.exr", "-D", "lights=points2", "--size", "48x48"]
-    run("render", *scene, "-o", "a.exr", "--grid", "4", "--no-shadows", "--classes", "a.png")
+    run("render", *scene, "-o", "a.exr", "--grid", "4", "--classes", "a.png")
     run("realtime", *scene, "-o", "b.exr")
     run("compare", "b.exr", "a.exr", "--classes", "a.png", "--gate", "image.noise_free")
 

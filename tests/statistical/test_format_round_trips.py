@@ -109,7 +109,6 @@ def test_measured_style(tmp_path, monkeypatch, capsys):
             "btf=m.exr",
             "--grid",
             "4",
-            "--no-shadows",
             *classes,
             *size,
         ],

@@ -46,7 +46,7 @@ def write_images(
 
 
 #: Grey levels of a class file in the order of `btfref.conventions.PixelClass`, so that a person sees the classes.
-_CLASS_GREYS = (0, 100, 200, 250, 150, 225)
+_CLASS_GREYS = (0, 100, 200, 250, 150, 50, 225)
 
 
 def save_classes(path: Path, classes: np.ndarray) -> None:

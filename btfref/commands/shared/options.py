@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from argparse import ArgumentParser, _ActionsContainer
+from argparse import ArgumentParser, BooleanOptionalAction, _ActionsContainer
 
 from btfref.commands.shared.reading import count, memory_size, size
 from btfref.errors import GRID, SEED
@@ -60,6 +60,11 @@ def add_keep(parser: _ActionsContainer) -> None:
         default="all",
         help="maps to load: all, or those that the camera's first hits need (default all)",
     )
+
+
+def add_shadows(parser: _ActionsContainer, text: str) -> None:
+    """``--shadows`` and ``--no-shadows``; without either the command decides."""
+    parser.add_argument("--shadows", action=BooleanOptionalAction, default=None, help=text)
 
 
 def add_only(parser: _ActionsContainer) -> None:

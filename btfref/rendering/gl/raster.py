@@ -130,7 +130,9 @@ def light_table(lights: Sequence[Light]) -> np.ndarray:
     return table
 
 
-def light_passes(light: Prepared | None, n_lights: int, n_faces: int) -> list[tuple[Facts, int]]:
+def light_passes(
+    light: Prepared | None, n_lights: int, n_faces: int, *, most: int = PASS
+) -> list[tuple[Facts, int]]:
     """Pictures of a mesh that add up: uniforms, and the number of triangles.
 
     Parameters
@@ -141,8 +143,10 @@ def light_passes(light: Prepared | None, n_lights: int, n_faces: int) -> list[tu
         Others.
     n_faces : int
         Of the mesh.
+    most : int
+        Lights of a picture.
     """
-    parts = [(first, min(first + PASS, n_lights)) for first in range(0, n_lights, PASS)]
+    parts = [(first, min(first + most, n_lights)) for first in range(0, n_lights, most)]
     ranges = [{"light_first": first, "light_end": end} for first, end in parts]
     nothing = {"light_first": 0, "light_end": 0}
     if light is None:

@@ -1,9 +1,9 @@
 """The real-time renderer: the same scene through GLSL, without a window.
 
-Direct light of directional and point lights and of an environment
-(:mod:`btfref.rendering.environment_light.lighting`), without cast shadows; the environment itself is not drawn. The
-sub-pixel grid is that of :mod:`btfref.rendering.offline.reference`: n × n regular
-samples a pixel, box filter. Each sample is one frame with a shifted projection; frames are added in float64.
+Direct light of directional, point, spot and area lights, with cast shadows (:mod:`btfref.rendering.gl.shadows`), and of
+an environment (:mod:`btfref.rendering.environment_light.lighting`), without; the environment itself is not drawn. The
+sub-pixel grid is that of :mod:`btfref.rendering.offline.reference`: n × n regular samples a pixel, box filter. Each
+sample is one frame with a shifted projection; frames are added in float64.
 """
 
 from __future__ import annotations
@@ -27,9 +27,11 @@ from btfref.rendering.gl.raster import (
     triangle_table,
     world_to_clip,
 )
+from btfref.rendering.gl.shadows import TRACED, ShadowMaps
 from btfref.scene.demand import MARGIN, kept_maps, number_kept
 from btfref.scene.description import SceneDescription, read_scene
 from btfref.scene.mirrored import mirrored_meshes
+from btfref.scene.shadows.occluders import has_occluders
 from btfref.scene.surfaces.materials import PlainMaterial
 from btfref.types import Facts, JitArray, SceneLike
 
@@ -62,6 +64,7 @@ def realtime(
     order: int | None = None,
     window: str | None = None,
     transfer: TransferSettings | None = None,
+    shadows: bool | None = None,
     count_fetches: bool = False,
 ) -> RenderResult:
     """Render a scene with OpenGL.
@@ -88,6 +91,10 @@ def realtime(
         That damps their ringing.
     transfer : btfref.rendering.environment_light.transfer.TransferSettings, optional
         Of the way "transfer".
+    shadows : bool, optional
+        Shadows that shapes cast under all lights but an environment. By default where a shape can be in the way
+        (:func:`btfref.scene.shadows.occluders.has_occluders`) and the scene has no environment, whose light casts none
+        but by the way "transfer".
     count_fetches : bool
         Count the texels that the representations fetch: ``meta["fetches"]``, the mean over covered samples.
 
@@ -99,10 +106,10 @@ def realtime(
         drawn as its mean albedo, with its plugin (:mod:`btfref.scene.surfaces.materials`); ``frame_ms`` is the median
         time of one frame (one sample a pixel), GPU timer and wall clock whichever is longer; ``gl_vendor``,
         ``gl_renderer``, ``gl_version``; ``negative_fraction``, the share of channels below zero, and ``not_finite``,
-        their number: nothing is clamped; ``kept``, how many maps were kept by file. With an environment
-        ``environment_path``, the way
-        taken, and what it says of itself, such as ``environment_lights`` and their ``estimated_error``; by file where
-        there are several.
+        their number: nothing is clamped; ``kept``, how many maps were kept by file; ``shadows``, and with them
+        ``shadow_maps``, the number of maps, ``shadow_traced``, that of the lights without one, and ``shadow_ms``, the
+        time to draw maps, once for all frames. With an environment ``environment_path``, the way taken, and what it
+        says of itself, such as ``environment_lights`` and their ``estimated_error``; by file where there are several.
 
     Raises
     ------
@@ -127,7 +134,10 @@ def realtime(
 
     lighting = lighting_of(scene, environment, lights=lights, order=order, window=window, transfer=transfer)
     load_file = load_needed if needed else None
-    with Renderer(scene, load_file, lighting=lighting, count_fetches=count_fetches) as renderer:
+    if shadows is None:
+        shadows = bool(scene.lights) and scene.environment is None and has_occluders(scene)
+    given: dict[str, Any] = {"lighting": lighting, "shadows": shadows, "count_fetches": count_fetches}
+    with Renderer(scene, load_file, **given) as renderer:
         offsets = [((i + 0.5) / grid, (j + 0.5) / grid) for j in range(grid) for i in range(grid)]
         total = np.zeros((scene.camera.height, scene.camera.width, 3))
         times, fetches = [], []
@@ -140,7 +150,8 @@ def realtime(
         meta = {
             "renderer": "realtime",
             "grid": grid,
-            "shadows": False,
+            "shadows": shadows,
+            **renderer.shadow_facts,
             "frame_ms": float(np.median(times)),
             "negative_fraction": float((image < 0).mean()),
             "not_finite": int((~np.isfinite(image)).sum()),
@@ -176,6 +187,8 @@ class Renderer:
         ``path -> Representation``; the default reads the files.
     lighting : btfref.rendering.environment_light.lighting.Lighting, optional
         Of the scene's environment; default: "auto".
+    shadows : bool
+        Cast by shapes, under lights.
     count_fetches : bool
         Have :meth:`fetches` tell the texels fetched; a little slower.
     """
@@ -186,6 +199,7 @@ class Renderer:
         load_file: LoadFile | None = None,
         *,
         lighting: Lighting | None = None,
+        shadows: bool = False,
         count_fetches: bool = False,
     ) -> None:
         if not scene.lights and scene.environment is None:
@@ -208,6 +222,7 @@ class Renderer:
         self._target = self._own(self.ctx.framebuffer([colour], self._own(self.ctx.depth_renderbuffer(size))))
         self._near, self._far = clip_planes(self.camera, scene.meshes)
         self._lights = self._own(device.upload(self.ctx, light_table(scene.lights), "scene_lights"))
+        self._shadows = self._own(ShadowMaps(self.ctx, scene)) if shadows and scene.lights else None
         self._n_lights, self._lighting = len(scene.lights), lighting
         if lighting is None:
             self._lighting = lighting_of(scene)
@@ -254,9 +269,9 @@ class Renderer:
                 self.ctx, rep, filter_type=material.filter_type, light=light
             )
             defines = {"N_LIGHTS": self._n_lights, **self._counting}
-            by_pixel = len(light_passes(light, self._n_lights, 1)) > 1 and (
-                light is None or light.bins is None
-            )
+            if self._shadows is not None:
+                defines |= self._shadows.defines
+            by_pixel = len(self._passes(light, 1)) > 1 and (light is None or light.bins is None)
             if by_pixel:
                 defines["SEEN"] = 1
                 self._what_is_seen()
@@ -267,6 +282,11 @@ class Renderer:
             self._shown[key] = self._own(shown), program, vertices, light
         table = None if exact else self._own(device.upload(self.ctx, triangle_table(mesh), "triangles"))
         self._meshes.append((mesh, key, table))
+
+    def _passes(self, light: Prepared | None, n_faces: int) -> list[tuple[Facts, int]]:
+        """Pictures of a mesh that add up."""
+        traced = self._shadows is not None and self._shadows.traced > 0
+        return light_passes(light, self._n_lights, n_faces, **({"most": TRACED} if traced else {}))
 
     def _program(
         self, shown: device.ShaderRepresentation, vertex: str, defines: dict[str, Any]
@@ -349,12 +369,13 @@ class Renderer:
             # gl_FragCoord is at pixel centres.
             "film_offset": np.asarray(offset, float) - 0.5,
             "film_height": float(camera.height),
+            **(self._shadows.uniforms if self._shadows is not None else {}),
         }
         ctx.finish()
         start = time.perf_counter()
         query = ctx.query(time=True)
         with query:
-            adds = any(len(light_passes(light, self._n_lights, 1)) > 1 for *_, light in self._shown.values())
+            adds = any(len(self._passes(light, 1)) > 1 for *_, light in self._shown.values())
             if adds:
                 if self._seen is not None:
                     self._fill_seen(common)
@@ -365,18 +386,21 @@ class Renderer:
                 if table is not None:
                     tables["triangles"] = table
                 tables["scene_lights"] = self._lights
+                if self._shadows is not None:
+                    tables |= self._shadows.textures
                 if by_pixel:
                     tables["seen"] = self._what_is_seen()[0]
                     ctx.depth_func, self._target.depth_mask = ">", False
                 device.bind(program, tables)
                 own = material_uniforms(mesh.shown, shown.texels, share * camera.pixel_angle)
                 own |= self._surface(mesh, table, common, adds=adds) | {"emission": mesh.emission}
+                if self._shadows is not None:
+                    own |= self._shadows.uniforms_of(index)
                 device.set_uniforms(program, {**common, **own, "mesh": index})
                 if light is not None and light.bins is not None and light.transfer is not None:
                     device.set_uniforms(program, {"transfer_components": light.transfer.table.shape[3]})
                 whole = quadrics.TRIANGLES if table is None else 1 if by_pixel else len(mesh.faces)
-                passes = light_passes(light, self._n_lights, whole)
-                for number, (values, count) in enumerate(passes):
+                for number, (values, count) in enumerate(self._passes(light, whole)):
                     device.set_uniforms(program, {**values, "pass": number})
                     vertices.render(ctx.TRIANGLES, vertices=3 * count)
                 if by_pixel:
@@ -391,6 +415,15 @@ class Renderer:
         """What can be lit anew, one :class:`btfref.rendering.environment_light.transfer_light.TransferLight` a mesh."""
         lights = [light for *_, light in self._shown.values()]
         return [light.transfer for light in lights if light is not None and light.transfer is not None]
+
+    @property
+    def shadow_facts(self) -> Facts:
+        """Number of the shadow maps, that of lights without one, and milliseconds to draw maps, with shadows."""
+        maps = self._shadows
+        if maps is None:
+            return {}
+        views = maps.defines.get("SHADOW_VIEWS", 0)
+        return {"shadow_maps": views, "shadow_traced": maps.traced, "shadow_ms": maps.milliseconds}
 
     @property
     def environment_facts(self) -> Facts:

@@ -83,6 +83,8 @@ def approximate(
     start, camera = time.perf_counter(), description.camera
     reps, prepared, total = {}, {}, np.zeros((camera.height * camera.width, 3))
     wanted = np.full(len(total), True) if pixels is None else np.ravel(pixels)
+    # A plain material is evaluated as a representation is.
+    rep: Any
     with loaded(scene, parameters, size=size, sampled=False) as made:
         shapes = drawn_shapes(made, [mesh.where for mesh in description.meshes])
         for surface in surfaces(made, grid):

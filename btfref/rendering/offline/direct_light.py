@@ -305,7 +305,7 @@ def _exact(scene: JitArray, ray: JitArray, shadows: bool, areas: AreaLights) -> 
         sample, power = emitter.sample_direction(si, mi.Point2f(0.5), valid)
         return i + 1, sum_ + reflected(sample.d, sample.p, power, valid & (sample.pdf > 0))
 
-    tables = [to_device(kind, a.T) for kind, a in _tables(areas)] if len(areas) else []
+    tables = areas.on_device() if len(areas) else []
 
     def of_point(i: JitArray, sum_: JitArray) -> tuple[JitArray, JitArray]:
         place, normal, power = (dr.gather(type(table), table, i, valid) for table in tables)
@@ -322,10 +322,3 @@ def _exact(scene: JitArray, ray: JitArray, shadows: bool, areas: AreaLights) -> 
             labels = ("light", "radiance")
             sum_ = dr.while_loop((start, sum_), lambda i, _, n=n: i < n, body, labels=labels)[1]
     return sum_
-
-
-def _tables(areas: AreaLights) -> list[tuple[type, np.ndarray]]:
-    """Position, normal and power of the points, and what each of them is on the device."""
-    import mitsuba as mi
-
-    return [(mi.Point3f, areas.position), (mi.Normal3f, areas.normal), (mi.Color3f, areas.power)]

@@ -17,6 +17,7 @@ from btfref.scene.demand import MARGIN, kept_maps, number_kept
 from btfref.scene.emitters.lights import checked_emitters, refuse_directed
 from btfref.scene.loading import loaded
 from btfref.scene.mirrored import seen_mirrored
+from btfref.scene.shadows.occluders import casts_shadows
 from btfref.types import Facts, JitArray, SceneLike
 
 #: Independent renders whose spread gives the variance of the mean: 15 degrees of freedom.
@@ -34,7 +35,7 @@ def render(
     spp: int | None = None,
     seed: int = 0,
     grid: int | None = None,
-    shadows: bool = True,
+    shadows: bool | None = None,
     size: tuple[int, int] | None = None,
     with_variance: bool = False,
     keep: str = "all",
@@ -59,8 +60,11 @@ def render(
         lights are points or directional, the material is evaluated towards each of them: nothing is random, and spp
         and seed say nothing. Under an environment directions of the light are random, and there are a variance and
         four independent ``pictures``. Needs a JIT variant.
-    shadows : bool
+    shadows : bool, optional
         False leaves cast shadows out: direct light of delta lights and an environment, whatever the scene's integrator.
+        By default they are there. ``meta["shadows"]`` then says whether any shape can be in the way
+        (:func:`btfref.scene.shadows.occluders.casts_shadows`): on a grid nothing is traced towards the lights where
+        none can.
     size : (int, int), optional
         Width and height in place of the scene's.
     with_variance : bool
@@ -104,7 +108,11 @@ def render(
         if not made.emitters():
             file = None if isinstance(scene, dict) else scene
             raise InputError("the scene has no light", file=file, field="emitter")
-        found = traced(made, spp=spp, seed=seed, grid=grid, shadows=shadows, with_variance=with_variance)
+        there = casts_shadows(made) if shadows is None else shadows
+        # Without a grid the scene's own integrator is kept, which no shape in the way changes.
+        traces = there if grid is not None else shadows is not False
+        found = traced(made, spp=spp, seed=seed, grid=grid, shadows=traces, with_variance=with_variance)
+        found.meta["shadows"] = there
         if not variant.startswith("scalar"):
             found.meta["mirrored"] = seen_mirrored(made)
     lost = found.meta["not_finite"]

@@ -53,8 +53,8 @@
   const MAGMA = [[0, 0, 4], [28, 16, 68], [79, 18, 123], [129, 37, 129], [181, 54, 122], [229, 80, 100], [251, 135, 97], [254, 194, 135], [252, 253, 191]];
   const VIRIDIS = [[68, 1, 84], [72, 40, 120], [62, 74, 137], [49, 104, 142], [38, 130, 142], [31, 158, 137], [53, 183, 121], [109, 205, 89], [180, 222, 44], [253, 231, 37]];
   const CLASSES = [["background", [128, 134, 142]], ["interior", [64, 121, 201]], ["silhouette", [224, 140, 40]],
-    ["mesostructure", [150, 90, 190]], ["edge", [96, 170, 130]],
-    ["other", [200, 90, 120]]];
+    ["mesostructure", [150, 90, 190]], ["edge", [96, 170, 130]], ["shadow_border", [200, 80, 90]],
+    ["other", [120, 105, 60]]];
   function ramp(stops, t) {
     const p = clamp(t, 0, 1) * (stops.length - 1), i = Math.min(Math.floor(p), stops.length - 2), f = p - i;
     return stops[i].map((low, c) => low + f * (stops[i + 1][c] - low));

@@ -61,6 +61,15 @@ class AreaLights:
         rows = zip(self.position, self.power, self.normal, strict=True)
         return [Light("area", position, power, normal) for position, power, normal in rows]
 
+    def on_device(self) -> list[JitArray]:
+        """Position, normal and power in the current JIT variant of Mitsuba."""
+        import mitsuba as mi
+
+        from btfref.numerics.device_arrays import to_device
+
+        kinds = (mi.Point3f, self.position), (mi.Normal3f, self.normal), (mi.Color3f, self.power)
+        return [to_device(kind, values.T) for kind, values in kinds]
+
     @property
     def facts(self) -> Facts:
         """JSON-able, for a picture's ``meta``; nothing without area lights."""

@@ -128,6 +128,7 @@ class Bench:
         self._clean: dict[tuple[str, Subject], Gates] = {}
         self._references: dict[Subject, tuple[Path, dict[str, str], np.ndarray, np.ndarray]] = {}
         self._converged: dict[Subject, tuple[RenderResult, np.ndarray]] = {}
+        self._shadowed: dict[Subject, tuple[np.ndarray, np.ndarray]] = {}
 
     @cached_property
     def btf(self) -> SampledBTF:
@@ -171,12 +172,28 @@ class Bench:
         from btfref.rendering.gl.renderer import realtime
 
         scene, parameters, expected, classes = self.reference(subject)
-        image = realtime(scene, parameters=parameters, **SETTINGS).image
+        image = realtime(scene, parameters=parameters, shadows=False, **SETTINGS).image
         if change == "silhouettes":
             classes = np.where(np.indices(classes.shape).sum(0) % 4 == 0, PixelClass.SILHOUETTE, classes)
         if change == "background":
             image = np.where(classes[..., None] == PixelClass.BACKGROUND, image + 0.01, image)
         return compare(image, expected, classes=classes, gate=GATES, flip=False).gates
+
+    def shadows(self, subject: Subject) -> Gates:
+        """Real time with cast shadows against the reference with its own."""
+        from btfref.rendering.gl.renderer import realtime
+        from btfref.rendering.offline.reference import render
+        from btfref.scene.pixel_classes import pixel_classes
+
+        parameters = {"btf": str(self.fit(subject)[1]), "lights": LIGHTS, "tiling": "4"}
+        scene, shared = scene_file(SCENE), {"parameters": parameters, **SETTINGS}
+        if subject not in self._shadowed:
+            classes = pixel_classes(scene, shadows=True, **shared)
+            self._shadowed[subject] = render(scene, shadows=True, **shared).image, classes
+        expected, classes = self._shadowed[subject]
+        image = realtime(scene, shadows=True, **shared).image
+        gates = (*GATES, "image.shadow_border")
+        return compare(image, expected, classes=classes, gate=gates, flip=False).gates
 
     def environment(self, subject: Subject, change: str = "") -> Gates:
         """Real time under an environment against a converged reference."""

@@ -141,6 +141,22 @@ FAULTS = (
         ),
     ),
     Fault(
+        "a shape lets the light through",
+        NOISE_FREE,
+        "shadows",
+        edit=("lib/light/shadows.glsl", "if (inside && met.w > 0.0", "if (inside && met.w > 9.0"),
+    ),
+    Fault(
+        "shadows fall a fiftieth of the scene off",
+        "image.shadow_border.nrmse",
+        "shadows",
+        edit=(
+            "lib/light/shadows.glsl",
+            "vec3 origin = point +",
+            "vec3 origin = point + vec3(0.02, 0.0, 0.0) +",
+        ),
+    ),
+    Fault(
         "edges a pixel off in eight bits", "image.eight_bit_silhouette.nrmse", "eight_bits", change="shifted"
     ),
     Fault(

@@ -13,11 +13,8 @@ uniform int light_end;
 const int LIGHT_DIRECTIONAL = 0, LIGHT_SPOT = 2, LIGHT_AREA = 3;
 
 vec3 light_incident(int i, vec3 point, out vec3 towards) {
-    vec4 position = table_fetch(scene_lights, 3 * i), power = table_fetch(scene_lights, 3 * i + 1);
-    vec4 axis = table_fetch(scene_lights, 3 * i + 2);
-#ifdef COUNT_FETCHES
-    fetches -= 3;  // of the light
-#endif
+    vec4 position = table_read(scene_lights, 3 * i), power = table_read(scene_lights, 3 * i + 1);
+    vec4 axis = table_read(scene_lights, 3 * i + 2);
     int kind = int(position.w);
     if (kind == LIGHT_DIRECTIONAL) {
         towards = position.xyz;

@@ -16,6 +16,11 @@ vec4 table_fetch(sampler2DArray table, int i) {
     return texelFetch(table, ivec3(i & 4095, (i >> 12) & 4095, i >> 24), 0);
 }
 
+// The same of what belongs to no representation, lights and shapes: it is not counted.
+vec4 table_read(sampler2DArray table, int i) {
+    return texelFetch(table, ivec3(i & 4095, (i >> 12) & 4095, i >> 24), 0);
+}
+
 uvec4 table_fetch(usampler2DArray table, int i) {
     COUNTED
     return texelFetch(table, ivec3(i & 4095, (i >> 12) & 4095, i >> 24), 0);

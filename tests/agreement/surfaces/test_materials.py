@@ -96,7 +96,7 @@ def test_diffuse_is_mitsubas_own(llvm, tmp_path):
             "bsdf": textured[3],
         },
     )
-    image = realtime(scene, grid=GRID)
+    image = realtime(scene, grid=GRID, shadows=False)
     assert image.meta["other_materials"] == {}
     classes = pixel_classes(scene, grid=GRID)
     assert not (classes == PixelClass.OTHER).any()
@@ -116,7 +116,7 @@ def mixed(mi, fits):
 def test_other_materials_are_counted_and_not_judged(llvm, fits):
     llvm.set_variant("scalar_rgb")
     scene = mixed(llvm, fits)
-    image, classes = realtime(scene, grid=GRID), pixel_classes(scene, grid=GRID)
+    image, classes = realtime(scene, grid=GRID, shadows=False), pixel_classes(scene, grid=GRID)
     expected = render(scene, grid=GRID, shadows=False)
     comparison = compare(image, expected, classes=classes, gate=(*GATES, "image.judged"), flip=False)
     assert_passed(comparison)

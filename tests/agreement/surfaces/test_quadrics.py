@@ -88,7 +88,7 @@ def assert_passed(comparison):
 def test_every_method_on_exact_shapes(llvm, fits, key):
     llvm.set_variant("scalar_rgb")
     scene = together(llvm, btf(fits, key))
-    assert_passed(judged(scene, realtime(scene, grid=GRID)))
+    assert_passed(judged(scene, realtime(scene, grid=GRID, shadows=False)))
 
 
 @pytest.mark.long
@@ -97,7 +97,7 @@ def test_each_shape_alone(llvm, fits, key):
     llvm.set_variant("scalar_rgb")
     for shape in shapes_of(llvm).values():
         scene = scene_of(llvm, [shape], btf(fits, key))
-        assert_passed(judged(scene, realtime(scene, grid=GRID)))
+        assert_passed(judged(scene, realtime(scene, grid=GRID, shadows=False)))
 
 
 @pytest.mark.parametrize("scale", [[0.5, 0.9, 0.6], pytest.param([-0.6, 0.6, 0.6], marks=pytest.mark.long)])
@@ -121,7 +121,7 @@ def test_triangles_in_their_place_fail(llvm, fits):
     scene = scene_of(llvm, [shapes_of(llvm)["pole"]], btf(fits, FIRST))
     described = read_scene(scene)
     meshes = tuple(replace(mesh, quadric=None) for mesh in described.meshes)
-    comparison = judged(scene, realtime(replace(described, meshes=meshes), grid=GRID))
+    comparison = judged(scene, realtime(replace(described, meshes=meshes), grid=GRID, shadows=False))
     failed = {gate.name for gate in comparison.gates if not gate.passed}
     assert "image.noise_free.p999" in failed
 
@@ -145,7 +145,7 @@ def test_a_camera_inside_of_a_sphere_sees_its_far_side(llvm, fits):
     llvm.set_variant("scalar_rgb")
     shape = {"type": "sphere", "radius": 9, "flip_normals": True}
     scene = scene_of(llvm, [shape], btf(fits, FIRST))
-    image = realtime(scene, grid=GRID)
+    image = realtime(scene, grid=GRID, shadows=False)
     assert (pixel_classes(scene, grid=GRID) != PixelClass.BACKGROUND).all()
     assert_passed(judged(scene, image))
 
