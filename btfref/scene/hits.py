@@ -273,7 +273,7 @@ def corner_frames(mesh: MeshDescription) -> np.ndarray:
     return np.swapaxes(turned_frame(frame, mesh.btf), -1, -2)
 
 
-def turned_frame(frame: np.ndarray, material: BtfMaterial) -> np.ndarray:
+def turned_frame(frame: np.ndarray, material: BtfMaterial | PlainMaterial) -> np.ndarray:
     """Frames, rows s, t, n in shape (..., 3, 3), taken to that of the transformed texture."""
     s, t, n = np.moveaxis(frame, -2, 0)
     return np.stack([*_turned(material.turn, s, t), n], -2)
