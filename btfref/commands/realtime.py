@@ -48,7 +48,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     add_image(parser)
     add_grid(parser)
     add_keep(parser)
-    add_shadows(parser, "of points and directions (default: where shapes do not all lie in one plane)")
+    add_shadows(parser, "of all lights but environments (default: where shapes do not all lie in one plane)")
     parser.add_argument(
         "--environment", choices=PATHS, default="auto", help="how an envmap lights (default auto)"
     )

@@ -1,5 +1,4 @@
-// Provides what a shadow ray meets: occluder_meet for a triangle, occluding_triangle for all of them, by a tree of boxes,
-// and occluding_quadric for spheres, disks and cylinders.
+// Provides what a shadow ray meets: occluder_meet, occluding_triangle by a tree of boxes, occluding_quadric.
 // Expects SHADOW_TRACED, SHADOW_QUADRICS and the table of btfref.rendering.gl.shadows.
 
 #include "lib/lookup/table.glsl"

@@ -52,8 +52,10 @@ def test_a_floor_casts_no_shadow():
         ({"a": {"type": "rectangle"}, "b": {"type": "disk"}}, False),
         ({"a": {"type": "rectangle"}, "b": {"type": "sphere"}}, True),
         ({"a": {"type": "cube"}}, True),
+        ({"a": {"type": "rectangle", "emitter": {"type": "area"}}}, False),
+        ({"a": {"type": "instance", "of": {"type": "ref", "id": "group"}}}, True),
     ],
-    ids=["rectangle", "one plane", "sphere", "cube"],
+    ids=["rectangle", "one plane", "sphere", "cube", "shining", "instance"],
 )
 def test_both_renderers_know_whether_a_scene_has_occluders(llvm, shapes, expected):
     llvm.set_variant("scalar_rgb")
@@ -65,7 +67,8 @@ def test_both_renderers_know_whether_a_scene_has_occluders(llvm, shapes, expecte
         for (name, shape), place in zip(shapes.items(), places, strict=False)
     }
     sun = {"sun": {"type": "directional", "direction": [0, 0.3, -1]}}
-    scene = {"type": "scene", "sensor": {"type": "perspective"}, **shapes, **sun}
+    group = {"group": {"type": "shapegroup", "of": {"type": "rectangle"}}}
+    scene = {"type": "scene", "sensor": {"type": "perspective"}, **group, **shapes, **sun}
     assert has_occluders(read_scene(scene)) == expected
     with loaded(scene) as made:
         assert casts_shadows(made) == expected
