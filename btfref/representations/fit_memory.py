@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from btfref.sampling.store.store import BTFStore
 
 #: Bytes that any fit takes beside the BTF: modules of SciPy and scikit-learn, lookups between the samples.
-FIT_BASE = 420 << 20
+FIT_BASE = 360 << 20
 
-#: Bytes per value of a method that says nothing of itself: the values, their copy as float32 and another one of it.
-UNKNOWN = 10.0
+#: What a method takes that says nothing of itself: the values, their copy as float32 and another one of it.
+UNKNOWN = 0, 10.0
 
 #: Bytes of a value in the stores for which methods state theirs.
 HALF = 2
@@ -38,8 +38,8 @@ def least_budget(method: Method, store: BTFStore) -> int:
     """
     values = 3 * len(store.views) * len(store.lights) * store.texels[0] * store.texels[1]
     fitting = method.fitting
-    each = fitting.FIT_BYTES if isinstance(fitting, StatesMemory) else UNKNOWN
-    return FIT_BASE + int(values * (each + np.dtype(store.dtype).itemsize - HALF))
+    blocks, each = fitting.FIT_MEMORY if isinstance(fitting, StatesMemory) else UNKNOWN
+    return FIT_BASE + blocks + int(values * (each + np.dtype(store.dtype).itemsize - HALF))
 
 
 def check_budget(method: Method, store: BTFStore, budget: int | None) -> None:

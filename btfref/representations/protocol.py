@@ -271,8 +271,8 @@ class StatesMemory(Protocol):
     """A module that says how much memory its fit takes."""
 
     @property
-    def FIT_BYTES(self) -> float:  # noqa: N802 - a constant of a module
-        """Bytes at the peak per value of a sampled BTF of half floats, the BTF itself included."""
+    def FIT_MEMORY(self) -> tuple[int, float]:  # noqa: N802 - a constant of a module
+        """Bytes at the peak: of blocks that do not grow, and per value of a BTF of half floats, itself included."""
 
 
 @runtime_checkable
