@@ -110,7 +110,7 @@ def _moving(
         truths.append(render(file, parameters=parameters | {"lod": "none"}, grid=grid, shadows=False).image)
         for kind in kinds:
             own = parameters | {"lod": kind}
-            pictures[kind, "GLSL"].append(realtime(file, parameters=own, grid=1).image)
+            pictures[kind, "GLSL"].append(realtime(file, parameters=own, grid=1, shadows=False).image)
             pictures[kind, "Mitsuba"].append(render(file, parameters=own, grid=1, shadows=False).image)
     truth = np.stack(truths).astype(float)
     seen = (truth != 0).any(-1)
@@ -165,7 +165,7 @@ def _cost(path: str, rounds: int, tell: Progress) -> tuple[Facts, dict[str, dict
     file = scene_file("plane")
     parameters = {k: {"btf": path, "tiling": str(n)} for k, n in (("near", NEAR), ("far", FAR))}
     fetches = {
-        k: realtime(file, parameters=p, grid=1, size=SIZE, count_fetches=True).meta["fetches"]
+        k: realtime(file, parameters=p, grid=1, shadows=False, size=SIZE, count_fetches=True).meta["fetches"]
         for k, p in parameters.items()
     }
     tell(1, 3, "GLSL")
