@@ -37,6 +37,9 @@ if TYPE_CHECKING:
     from btfref.types import Facts, JitArray, Progress
 
 
+#: See :mod:`btfref.representations.fit_memory`.
+FIT_MEMORY = 0, 10.0
+
 #: "paper": Table 1's four lobes, in floats.
 PRESETS = {"paper": {"lobes": 4, "storage": "float"}}
 

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from btfref.types import Facts, Progress
 
 
+#: See :mod:`btfref.representations.fit_memory`.
+FIT_MEMORY = 0, 10.0
+
 #: "paper": Table 1's four lobes, in floats.
 PRESETS: dict[str, Facts] = {"paper": {"lobes": 4, "bounded": False, "storage": "float"}}
 

@@ -43,6 +43,9 @@ if TYPE_CHECKING:
     from btfref.types import Facts, JitArray, Progress
 
 
+#: See :mod:`btfref.representations.fit_memory`.
+FIT_MEMORY = 0, 13.5
+
 #: "paper": two lobes in floats.
 PRESETS = {"paper": {"lobes": 2, "storage": "float"}}
 

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
     from btfref.types import Facts, Progress
 
 
+#: See :mod:`btfref.representations.fit_memory`.
+FIT_MEMORY = 0, 9.8
+
 #: "paper": all 81 views in floats.
 PRESETS = {"paper": {"storage": "float"}}
 

@@ -51,7 +51,10 @@ if TYPE_CHECKING:
     from btfref.types import Progress
 
 
-__all__ = ["PRESETS", "Representation", "fit"]
+__all__ = ["FIT_MEMORY", "PRESETS", "Representation", "fit"]
+
+#: See :mod:`btfref.representations.fit_memory`.
+FIT_MEMORY = 0, 6.5
 
 #: "paper": factors as the chain leaves them, all in 8 bits, scales from the normalisation alone.
 PRESETS = {"paper": {"sweeps": 0, "rescale": False, "storage": "byte", "code": "linear"}}

@@ -35,7 +35,10 @@ if TYPE_CHECKING:
     from btfref.types import Facts, Progress
 
 
-__all__ = ["PRESETS", "Representation", "fit"]
+__all__ = ["FIT_MEMORY", "PRESETS", "Representation", "fit"]
+
+#: See :mod:`btfref.representations.fit_memory`.
+FIT_MEMORY = 0, 6.5
 
 #: "paper": factors as the system leaves them, all in 8 bits, scales from the normalisation alone.
 PRESETS = {

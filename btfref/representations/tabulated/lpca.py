@@ -42,6 +42,9 @@ if TYPE_CHECKING:
     from btfref.types import Facts, Progress
 
 
+#: See :mod:`btfref.representations.fit_memory`.
+FIT_MEMORY = 0, 7.6
+
 #: "paper": the setting of the 2004 paper's timings, 16 clusters with a mean and 4 components, in floats.
 PRESETS = {"paper": {"clusters": 16, "components": 4, "storage": "float"}}
 

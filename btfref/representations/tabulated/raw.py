@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     from btfref.types import Facts, Progress
 
 
+#: See :mod:`btfref.representations.fit_memory`.
+FIT_MEMORY = 0, 8.0
+
 PRESETS: dict[str, Facts] = {"paper": {}}
 
 

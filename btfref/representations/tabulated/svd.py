@@ -37,6 +37,9 @@ if TYPE_CHECKING:
     from btfref.types import Facts, Progress
 
 
+#: See :mod:`btfref.representations.fit_memory`.
+FIT_MEMORY = 0, 6.8
+
 #: Koudelka et al. keep 150 components for one texture; 16 cost a lookup about three times what local PCA's 4 cost.
 PRESETS = {"paper": {"components": 150, "storage": "float"}}
 

@@ -100,7 +100,13 @@ FAULTS = {
         "float f = 0.0;",
     ),
     "horizon forgotten": ("sky", "environment", "(n + 1.0) * lobe.x)", "(n + 1.0))"),
-    "axis not moved": ("sky", "environment", "vec3(axis.xy * lobe.y, lobe.z)", "axis"),
+    "axis not moved": (
+        "sky",
+        "environment",
+        "vec3(outwards * sqrt(max(1.0 - lobe.y * lobe.y, 0.0)), lobe.y)",
+        "axis",
+    ),
+    "lobes not parted": ("sky", "environment", "vec3 aside = lobe.w *", "vec3 aside = 0.0 *"),
     "small lights lost": (
         "light",
         "split_environment",

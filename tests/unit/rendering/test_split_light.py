@@ -23,15 +23,19 @@ def sun_and_sky():
 
 @pytest.mark.parametrize("cosine", [False, True])
 @pytest.mark.parametrize(
-    ("environment", "most"),
-    [(sun_and_sky(), 4), (bright_texel([0.2, 0.4, 0.6], background=0.01), 4), (studio(shape=(32, 64)), MOST)],
+    ("environment", "least", "most"),
+    [
+        (sun_and_sky(), 1, 4),
+        (bright_texel([0.2, 0.4, 0.6], background=0.01), 1, 4),
+        (studio(shape=(32, 64)), 0, MOST),
+    ],
     ids=["sun", "texel", "studio"],
 )
-def test_nothing_is_lost_and_the_target_is_reached(environment, most, cosine):
+def test_nothing_is_lost_and_the_target_is_reached(environment, least, most, cosine):
     w, power = environment.cells()
     found = split_light(environment, EDGE, cosine=cosine)
     assert found.lights.error <= TARGET
-    assert 1 <= len(found.lights) <= most
+    assert least <= len(found.lights) <= most
     rest = found.rest.power
     np.testing.assert_array_equal(found.rest.w, w)
     assert (rest >= 0).all()

@@ -27,7 +27,7 @@ REPRESENTATIONS = {
 }
 
 #: Likewise of fit modules.
-MODULES = {"FitModule": set(methods()), "FitsPartially": {"raw"}}
+MODULES = {"FitModule": set(methods()), "FitsPartially": {"raw"}, "StatesMemory": set(methods())}
 
 #: Likewise of Dr.Jit evaluators.
 EVALUATORS = {

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 #: What heights can be told by.
 SIMILARITIES = ("reciprocity", "correlation")
 
+#: See :mod:`btfref.representations.fit_memory`.
+FIT_MEMORY = 0, 5.0
+
 #: "paper": correlation in windows of 5 × 5 and depth weight 0.2 (section 6). The unit of the paper's smoothness, 0.1,
 #: is not given; in ours 0.1 flattens everything, 0.02 is the best for the correlation.
 PRESETS = {
