@@ -21,7 +21,7 @@ from btfref.provenance import __version__
 if TYPE_CHECKING:
     from btfref.comparison import compare
     from btfref.numerics.sphere.directions import DirectionSet
-    from btfref.rendering.gl.renderer import realtime
+    from btfref.rendering.gl.realtime import realtime
     from btfref.rendering.offline.reference import render
     from btfref.representations.protocol import Representation
     from btfref.sampling import SampledBTF
@@ -46,7 +46,7 @@ _HOMES = {
     "DirectionSet": "btfref.numerics.sphere.directions",
     "SampledBTF": "btfref.sampling",
     "compare": "btfref.comparison",
-    "realtime": "btfref.rendering.gl.renderer",
+    "realtime": "btfref.rendering.gl.realtime",
     "render": "btfref.rendering.offline.reference",
     "synthesize": "btfref.sampling.synthesis",
 }

@@ -205,7 +205,7 @@ class _Chain:
     def renderers_cell(self, method: str, scene: str, lights: str) -> Cell:
         """Real-time image against the reference, both reading one file and one scene."""
         from btfref.comparison import compare
-        from btfref.rendering.gl.renderer import realtime
+        from btfref.rendering.gl.realtime import realtime
         from btfref.report import Cell
 
         reference = self.reference(method, scene, lights)

@@ -243,7 +243,7 @@ def _cell(cache: Cache, spec: Spec, settings: Settings) -> CellResult:
 
 def _under_deltas(path: Path, spec: Spec, views: Views, settings: Settings, shared: Facts) -> _Chain:
     """Chain, reference, picture in real time, gates, facts and parts of stages where nothing is random."""
-    from btfref.rendering.gl.renderer import realtime
+    from btfref.rendering.gl.realtime import realtime
     from btfref.rendering.offline.approximate import approximate
     from btfref.rendering.offline.reference import render
 
@@ -261,7 +261,7 @@ def _under_environment(path: Path, spec: Spec, views: Views, settings: Settings,
     Its four batches are the stage of the fit as well. Real time approximates here, and its port is a part of that
     stage: GLSL against the same approximation in float64, at pixels drawn at random.
     """
-    from btfref.rendering.gl.renderer import realtime
+    from btfref.rendering.gl.realtime import realtime
     from btfref.rendering.offline.approximate import approximate
     from btfref.rendering.offline.converged import converged
 

@@ -9,7 +9,7 @@ from btfref.comparison import compare
 from btfref.conventions import PixelClass
 from btfref.errors import InputError
 from btfref.gates import tolerance
-from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.gl.realtime import realtime
 from btfref.rendering.offline.reference import render
 from btfref.scene.description import read_scene
 from btfref.scene.pixel_classes import pixel_classes

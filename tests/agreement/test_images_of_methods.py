@@ -11,7 +11,7 @@ from btfref.gates import tolerance
 from btfref.platform import shader_directory
 from btfref.registry import methods
 from btfref.rendering.gl import device
-from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.gl.realtime import realtime
 from btfref.rendering.offline.reference import render
 from btfref.representations import save
 from btfref.scene.pixel_classes import pixel_classes

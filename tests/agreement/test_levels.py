@@ -10,7 +10,7 @@ from btfref.comparison.comparison import agreement
 from btfref.gates.tolerances import tolerance
 from btfref.numerics.device_arrays import to_device
 from btfref.numerics.footprint import cone_footprint, probe_weight
-from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.gl.realtime import realtime
 from btfref.rendering.offline.reference import render
 from btfref.representations import save
 from btfref.representations.laplacian import definition as laplacian

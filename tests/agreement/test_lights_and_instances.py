@@ -10,7 +10,7 @@ from btfref.conventions import PixelClass
 from btfref.errors import InputError
 from btfref.gates import tolerance
 from btfref.rendering.gl import renderer
-from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.gl.realtime import realtime
 from btfref.rendering.offline.approximate import approximate
 from btfref.rendering.offline.converged import converged
 from btfref.rendering.offline.reference import render

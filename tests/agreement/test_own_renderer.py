@@ -14,7 +14,7 @@ from btfref.cli import main
 from btfref.errors import InputError
 from btfref.images import save_image
 from btfref.images.files import load_image
-from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.gl.realtime import realtime
 from btfref.scene.shipped import scene_file
 from btfref.testing import assert_matches_reference
 from btfref.validate.own_renderer import Reference, judge_image, reference_of, representation_for

@@ -14,7 +14,7 @@ from btfref.gates import tolerance
 from btfref.numerics.sphere import interpolation
 from btfref.registry import methods
 from btfref.rendering.gl.probe import probe
-from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.gl.realtime import realtime
 from btfref.representations import load, save
 from btfref.representations.file.resident import KINDS, SLOTS, keeping, with_views
 from btfref.representations.file.rows import RowReader

@@ -10,7 +10,7 @@ from probes import hemisphere
 from btfref.comparison import compare
 from btfref.conventions import PixelClass
 from btfref.gates.tolerances import tolerance
-from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.gl.realtime import realtime
 from btfref.rendering.offline.reference import render
 from btfref.representations import save
 from btfref.representations.factored import cmf

@@ -15,7 +15,7 @@ from btfref.comparison.significance import tile_equivalence, tile_half_widths
 from btfref.conventions import PixelClass
 from btfref.gates.tolerances import tolerance
 from btfref.registry import methods
-from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.gl.realtime import realtime
 from btfref.rendering.offline.converged import converged
 from btfref.rendering.offline.direct_light import regular
 from btfref.rendering.offline.reference import render

@@ -103,7 +103,7 @@ def _error(image: RenderResult, reference: RenderResult, inside: np.ndarray) -> 
 def _prefiltered(fitted: Callable[[str], Path], quick: bool) -> tuple[list[Facts], list[float]]:
     """Every method with prefiltered maps, on a sphere."""
     from btfref.registry import methods
-    from btfref.rendering.gl.renderer import realtime
+    from btfref.rendering.gl.realtime import realtime
     from btfref.rendering.offline.converged import converged
 
     rows, raw = [], []
@@ -123,7 +123,7 @@ def _prefiltered(fitted: Callable[[str], Path], quick: bool) -> tuple[list[Facts
 
 def _order(fitted: Callable[[str], Path], quick: bool) -> tuple[list[Facts], list[float]]:
     """Spherical harmonics of each order on a sphere, with and without a window, and lights for comparison."""
-    from btfref.rendering.gl.renderer import realtime
+    from btfref.rendering.gl.realtime import realtime
     from btfref.rendering.offline.converged import converged
 
     rows, raw = [], []
@@ -149,7 +149,7 @@ def _order(fitted: Callable[[str], Path], quick: bool) -> tuple[list[Facts], lis
 def _transfer(fitted: Callable[[str], Path], quick: bool) -> tuple[list[Facts], list[float]]:
     """Compression of the transfer in a bowl: relative RMSE to spherical harmonics per pixel."""
     from btfref.rendering.environment_light.transfer import TransferSettings
-    from btfref.rendering.gl.renderer import realtime
+    from btfref.rendering.gl.realtime import realtime
 
     file, settings = _scene(fitted("lpca"), "bowl", "studio")
     inside, rows, raw = _inside(file, settings), [], []

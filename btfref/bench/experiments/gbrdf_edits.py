@@ -16,7 +16,7 @@ from PIL import Image
 from btfref.images import save_image
 from btfref.numerics.microfacets import isotropic_ndf
 from btfref.numerics.sphere.parabolic import texel_directions
-from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.gl.realtime import realtime
 from btfref.representations import save
 from btfref.representations.gbrdf.build import from_maps, from_photograph
 from btfref.representations.gbrdf.geometry import from_mesostructure

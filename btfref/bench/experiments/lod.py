@@ -94,7 +94,7 @@ def _moving(
     scene: str, path: str, frames: int, grid: int, tell: Progress
 ) -> tuple[Facts, dict[str, np.ndarray]]:
     """Error and flicker of a scene, and the pictures of its first frame."""
-    from btfref.rendering.gl.renderer import realtime
+    from btfref.rendering.gl.realtime import realtime
     from btfref.rendering.offline.reference import render
     from btfref.scene.shipped import scene_file
 
@@ -156,7 +156,8 @@ def _cost(path: str, rounds: int, tell: Progress) -> tuple[Facts, dict[str, dict
     """Fetches and times of a plane that fills the picture, near and far."""
     import drjit as dr
 
-    from btfref.rendering.gl.renderer import Renderer, realtime
+    from btfref.rendering.gl.realtime import realtime
+    from btfref.rendering.gl.renderer import Renderer
     from btfref.rendering.offline import reference
     from btfref.scene import camera, loading
     from btfref.scene.description import read_scene

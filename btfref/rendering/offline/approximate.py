@@ -42,7 +42,7 @@ def approximate(
     pixels: np.ndarray | None = None,
     **options: Any,
 ) -> RenderResult:
-    """What :func:`btfref.rendering.gl.renderer.realtime` approximates, evaluated in float64.
+    """What :func:`btfref.rendering.gl.realtime.realtime` approximates, evaluated in float64.
 
     Parameters
     ----------

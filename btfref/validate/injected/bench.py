@@ -169,7 +169,7 @@ class Bench:
 
     def picture(self, subject: Subject, change: str = "") -> Gates:
         """Real time against the reference; the fault without a shader is light where nothing is."""
-        from btfref.rendering.gl.renderer import realtime
+        from btfref.rendering.gl.realtime import realtime
 
         scene, parameters, expected, classes = self.reference(subject)
         image = realtime(scene, parameters=parameters, shadows=False, **SETTINGS).image
@@ -181,7 +181,7 @@ class Bench:
 
     def shadows(self, subject: Subject) -> Gates:
         """Real time with cast shadows against the reference with its own."""
-        from btfref.rendering.gl.renderer import realtime
+        from btfref.rendering.gl.realtime import realtime
         from btfref.rendering.offline.reference import render
         from btfref.scene.pixel_classes import pixel_classes
 
@@ -197,7 +197,7 @@ class Bench:
 
     def environment(self, subject: Subject, change: str = "") -> Gates:
         """Real time under an environment against a converged reference."""
-        from btfref.rendering.gl.renderer import realtime
+        from btfref.rendering.gl.realtime import realtime
         from btfref.rendering.offline.converged import converged
         from btfref.scene.pixel_classes import pixel_classes
 

@@ -69,7 +69,7 @@ def testify(path: PathLike) -> Testimony:
     Testimony
     """
     from btfref import representations
-    from btfref.rendering.gl.renderer import realtime
+    from btfref.rendering.gl.realtime import realtime
     from btfref.rendering.offline.reference import render
 
     representation, scene = representations.load(path), WitnessScene()

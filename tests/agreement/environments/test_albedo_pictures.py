@@ -15,7 +15,7 @@ from btfref.numerics.sphere.quadrature import gauss_hemisphere
 from btfref.registry import methods
 from btfref.rendering.environment_light.lighting import Lighting
 from btfref.rendering.environment_light.prepared import Prepared
-from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.gl.realtime import realtime
 from btfref.rendering.offline.approximate import approximate
 from btfref.scene.pixel_classes import pixel_classes
 from btfref.scene.shipped import scene_file

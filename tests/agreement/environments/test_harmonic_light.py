@@ -99,7 +99,7 @@ def test_more_bands_are_better_and_windows_cost_sharpness(fits, rng):
 
 
 def test_pictures_equal_float64(need, fits):
-    from btfref.rendering.gl.renderer import realtime
+    from btfref.rendering.gl.realtime import realtime
 
     need("gl"), need("llvm")
     parameters = {"btf": str(fits.path("lpca")), "lights": "envmap", "environment": "studio"}

@@ -20,7 +20,7 @@ from btfref.rendering.environment_light.image_light import radiance
 from btfref.rendering.environment_light.lighting import Lighting
 from btfref.rendering.gl import composer, device
 from btfref.rendering.gl.probe import probe_environment
-from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.gl.realtime import realtime
 from btfref.rendering.offline.approximate import approximate
 from btfref.rendering.offline.reference import render
 from btfref.scene.description import read_scene

@@ -73,7 +73,7 @@ def test_black_and_wrong_numbers():
 @pytest.mark.parametrize("key", list(methods()))
 def test_pictures_equal_float64(need, fits, tmp_path, key):
     """The generic path of every method: GLSL against NumPy at the same rays, both sides of a cloth."""
-    from btfref.rendering.gl.renderer import realtime
+    from btfref.rendering.gl.realtime import realtime
 
     need("gl"), need("llvm")
     save_image(tmp_path / "sky.exr", half_sky().radiance)
@@ -92,7 +92,7 @@ def test_pictures_equal_float64(need, fits, tmp_path, key):
 
 def test_thousands_of_lights_are_all_drawn(need, fits):
     """A software rasterizer ends long loops without a word: lights are drawn in passes, and none is lost."""
-    from btfref.rendering.gl.renderer import realtime
+    from btfref.rendering.gl.realtime import realtime
 
     need("gl"), need("llvm")
     parameters = {"btf": str(fits.path("lpca")), "lights": "constant"}

@@ -19,7 +19,8 @@ from btfref.rendering.environment_light.transfer import (
     corner_matrices,
     vertex_transfer,
 )
-from btfref.rendering.gl.renderer import Renderer, realtime
+from btfref.rendering.gl.realtime import realtime
+from btfref.rendering.gl.renderer import Renderer
 from btfref.rendering.offline.approximate import approximate
 from btfref.rendering.offline.reference import render
 from btfref.scene.description import Light, read_scene

@@ -13,7 +13,7 @@ from btfref.conventions import PixelClass
 from btfref.gates import tolerance
 from btfref.platform import shader_directory
 from btfref.rendering.gl import composer, device
-from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.gl.realtime import realtime
 from btfref.rendering.offline.reference import render
 from btfref.scene.pixel_classes import pixel_classes
 

@@ -12,7 +12,8 @@ from btfref.conventions import PixelClass
 from btfref.gates import tolerance
 from btfref.rendering.environment_light.lighting import lighting_of
 from btfref.rendering.gl import composer, device
-from btfref.rendering.gl.renderer import Renderer, realtime
+from btfref.rendering.gl.realtime import realtime
+from btfref.rendering.gl.renderer import Renderer
 from btfref.rendering.offline.approximate import approximate
 from btfref.rendering.offline.reference import render
 from btfref.scene.description import read_scene

@@ -8,7 +8,7 @@ from btfref.comparison import compare
 from btfref.conventions import PixelClass
 from btfref.gates import tolerance
 from btfref.registry import methods
-from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.gl.realtime import realtime
 from btfref.rendering.offline.approximate import approximate
 from btfref.rendering.offline.reference import render
 from btfref.scene.description import read_scene

@@ -10,7 +10,7 @@ from btfref.cli import main
 from btfref.errors import BtfrefError, InputError
 from btfref.gates.tolerances import tolerance
 from btfref.numerics.sphere.directions import directions, spherical
-from btfref.rendering.gl.renderer import realtime
+from btfref.rendering.gl.realtime import realtime
 from btfref.rendering.offline.reference import render
 from btfref.representations import load, save
 from btfref.representations.tabulated import raw
