@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = 0, 10.0
+FIT_MEMORY = 220 << 20, 3.8
 
 #: "paper": Table 1's four lobes, in floats.
 PRESETS = {"paper": {"lobes": 4, "storage": "float"}}

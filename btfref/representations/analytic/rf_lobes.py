@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = 0, 13.5
+FIT_MEMORY = 560 << 20, 3.6
 
 #: "paper": two lobes in floats.
 PRESETS = {"paper": {"lobes": 2, "storage": "float"}}

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = 0, 9.8
+FIT_MEMORY = 170 << 20, 3.8
 
 #: "paper": all 81 views in floats.
 PRESETS = {"paper": {"storage": "float"}}

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 __all__ = ["FIT_MEMORY", "PRESETS", "Representation", "fit"]
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = 0, 6.5
+FIT_MEMORY = 0, 6.2
 
 #: "paper": factors as the system leaves them, all in 8 bits, scales from the normalisation alone.
 PRESETS = {

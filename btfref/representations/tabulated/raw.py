@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = 0, 8.0
+FIT_MEMORY = 0, 6.6
 
 PRESETS: dict[str, Facts] = {"paper": {}}
 

@@ -1,0 +1,68 @@
+"""Budgets of fits: what a method says it takes is what a process takes at most."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from btfref.errors import InputError
+from btfref.numerics.sphere.directions import directions
+from btfref.registry import method, methods
+from btfref.representations.fit_memory import FIT_BASE, UNKNOWN, check_budget, least_budget
+from btfref.sampling import SampledBTF
+
+ROOT = Path(__file__).parents[3]
+
+
+def store(texels, dtype="float16"):
+    """What a budget is found from."""
+    grid = directions("ubo81")
+    return SimpleNamespace(views=grid, lights=grid, texels=(texels, texels), dtype=np.dtype(dtype))
+
+
+@pytest.mark.parametrize("key", methods())
+def test_a_budget_grows_with_the_values(key):
+    row, values = method(key), 3 * 81 * 81 * 64 * 64
+    small, large = least_budget(row, store(32)), least_budget(row, store(64))
+    assert FIT_BASE < small < large
+    # The values themselves, once at least; in float32 twice as much for them.
+    assert large - small >= 2 * 3 / 4 * values
+    assert least_budget(row, store(64, "float32")) - large == pytest.approx(2 * values, abs=1)
+    check_budget(row, store(64), large)
+    with pytest.raises(InputError, match=f"too small to fit {key}.*at least {large / 2**20:.0f} MiB"):
+        check_budget(row, store(64), large - (1 << 20))
+
+
+def test_a_method_that_says_nothing_counts_as_a_large_one():
+    silent = SimpleNamespace(key="silent", fitting=SimpleNamespace(fit=None, PRESETS={}))
+    blocks, each = UNKNOWN
+    assert least_budget(silent, store(1)) == FIT_BASE + blocks + int(3 * 81 * 81 * each)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("key", methods())
+def test_a_fit_keeps_its_budget(key, tmp_path, rng):
+    """In a process of its own, with the least budget that is let through."""
+    grid = directions("ubo81")
+    shades = rng.uniform(0.05, 0.5, (24, 24, 3))
+    lobes = np.maximum(grid.vectors @ grid.vectors.T, 0) ** 4 + 0.3
+    values = (lobes * grid.vectors[:, 2])[:, :, None, None, None] * shades
+    SampledBTF(values.astype(np.float16), grid, grid).save(tmp_path / "x.btf.zarr")
+    budget = least_budget(method(key), store(24))
+    made = subprocess.run(
+        [sys.executable, "-m", "btfref", "fit", key, "x.btf.zarr", "-o", "x.exr", "--memory", str(budget)],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    assert made.returncode == 0, made.stderr
+    peak = int(
+        re.search(r"largest memory of the process: .*\(([\d ]+) bytes\)", made.stdout)[1].replace(" ", "")
+    )
+    assert peak <= budget
