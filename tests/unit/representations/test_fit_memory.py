@@ -32,7 +32,7 @@ def test_a_budget_grows_with_the_values(key):
     assert FIT_BASE < small < large
     # The values themselves, once at least; in float32 twice as much for them.
     assert large - small >= 2 * 3 / 4 * values
-    assert least_budget(row, store(64, "float32")) - large == pytest.approx(2 * values, abs=1)
+    assert least_budget(row, store(64, "float32")) - large in (2 * values - 1, 2 * values, 2 * values + 1)
     check_budget(row, store(64), large)
     with pytest.raises(InputError, match=f"too small to fit {key}.*at least {large / 2**20:.0f} MiB"):
         check_budget(row, store(64), large - (1 << 20))
