@@ -80,7 +80,7 @@ def run(args: Namespace) -> int:
             raise InputError("the method needs the whole BTF", field="--partial", got=row.key)
         representation = fitting.fit_partial(open_store(args.btf), **parameters)
     else:
-        check_budget(row, open_store(args.btf), args.memory)
+        check_budget(row, open_store(args.btf), args.memory, parameters)
         btf = SampledBTF.load(args.btf, variance=False)
         with Progress() as progress:
             representation = between.fit(row, btf, seed=args.seed, progress=progress, **parameters)

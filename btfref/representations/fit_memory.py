@@ -2,47 +2,67 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from btfref.representations.protocol import StatesMemory
+from btfref.representations.protocol import FitMemory, StatesMemory
 from btfref.sampling import memory
 
 if TYPE_CHECKING:
     from btfref.registry import Method
     from btfref.sampling.store.store import BTFStore
+    from btfref.types import Facts
 
 #: Bytes that any fit takes beside the BTF: modules of SciPy and scikit-learn, lookups between the samples.
 FIT_BASE = 360 << 20
 
 #: What a method takes that says nothing of itself: the values, their copy as float32 and another one of it.
-UNKNOWN = 0, 10.0
+UNKNOWN = FitMemory(10.0)
+
+#: Copies of the tables while they are found, scaled, stored and looked up, in float32.
+TABLE_COPIES = 8
 
 #: Bytes of a value in the stores for which methods state theirs.
 HALF = 2
 
 
-def least_budget(method: Method, store: BTFStore) -> int:
+def least_budget(method: Method, store: BTFStore, parameters: Facts | None = None) -> int:
     """The smallest budget in which a method can be fitted to a store.
 
     Parameters
     ----------
     method : btfref.registry.Method
     store : BTFStore
+    parameters : dict, optional
+        Of the fit, where they are not the defaults.
 
     Returns
     -------
     int
         Bytes of the process at its peak.
     """
-    values = 3 * len(store.views) * len(store.lights) * store.texels[0] * store.texels[1]
+    pairs, texels = len(store.views) * len(store.lights), store.texels[0] * store.texels[1]
     fitting = method.fitting
-    blocks, each = fitting.FIT_MEMORY if isinstance(fitting, StatesMemory) else UNKNOWN
-    return FIT_BASE + blocks + int(values * (each + np.dtype(store.dtype).itemsize - HALF))
+    states = fitting.FIT_MEMORY if isinstance(fitting, StatesMemory) else UNKNOWN
+    given = method.parameters | (parameters or {}) if states.scales or states.tables else {}
+    blocks = float(states.blocks)
+    for name in states.scales:
+        blocks *= max(1.0, _number(given[name]) / _number(method.parameters[name]))
+    tables = math.prod(_number(given[name]) for name in states.tables) if states.tables else 0
+    blocks += TABLE_COPIES * 4 * tables * (3 * pairs + texels)
+    return FIT_BASE + int(blocks + 3 * pairs * texels * (states.each + np.dtype(store.dtype).itemsize - HALF))
 
 
-def check_budget(method: Method, store: BTFStore, budget: int | None) -> None:
+def _number(value: object) -> float:
+    """A parameter that counts something; what is none is refused by the fit itself."""
+    return float(value) if isinstance(value, int | float) and value > 0 else 1.0
+
+
+def check_budget(
+    method: Method, store: BTFStore, budget: int | None, parameters: Facts | None = None
+) -> None:
     """Refuse a fit that would take more than its budget.
 
     Parameters
@@ -51,12 +71,14 @@ def check_budget(method: Method, store: BTFStore, budget: int | None) -> None:
     store : BTFStore
     budget : int or None
         Bytes of the process; by default half of the machine's memory.
+    parameters : dict, optional
+        Of the fit, where they are not the defaults.
 
     Raises
     ------
     InputError
     """
     budget = memory.default_budget() if budget is None else budget
-    least = least_budget(method, store)
+    least = least_budget(method, store, parameters)
     if least > budget:
         memory.refuse(budget, least, what=f"memory budget too small to fit {method.key} to so many values")

@@ -27,6 +27,12 @@ if TYPE_CHECKING:
 #: Points evaluated at a time: bounds the memory of the gathered neighbourhoods.
 CHUNK = 1 << 14
 
+#: Pairs of directions in the stencils of a lookup, at most.
+PAIRS = 16
+
+#: Values that lookups gather at a time from tables with many entries: 160 MiB in float64.
+GATHERED = 20 << 20
+
 
 @dataclass(frozen=True)
 class Stencils:
@@ -83,6 +89,8 @@ def evaluate_tabulated(
     uv: ArrayLike,
     w_light: ArrayLike,
     w_view: ArrayLike,
+    *,
+    gathered: int = 1,
 ) -> np.ndarray:
     """Evaluate a method that interpolates tables over measured directions and texels.
 
@@ -93,6 +101,8 @@ def evaluate_tabulated(
     kernel : callable
         ``Stencils -> (N, 3)`` float64.
     uv, w_light, w_view : array_like, shape (..., 2), (..., 3), (..., 3)
+    gathered : int
+        Values that the kernel gathers for a lookup: with many, fewer are done at a time.
 
     Returns
     -------
@@ -107,7 +117,7 @@ def evaluate_tabulated(
         light, light_weight = lights.stencil(w_light, hold=False)
         return kernel(Stencils(texel, texel_weight, view, view_weight, light, light_weight))
 
-    return evaluate_points(lookup, uv, w_light, w_view)
+    return evaluate_points(lookup, uv, w_light, w_view, gathered=gathered)
 
 
 def evaluate_points(
@@ -116,6 +126,7 @@ def evaluate_points(
     w_light: ArrayLike,
     w_view: ArrayLike,
     *scalars: ArrayLike,
+    gathered: int = 1,
 ) -> np.ndarray:
     """Evaluate point by point: broadcast, leave out what is not valid, bound the memory.
 
@@ -126,6 +137,8 @@ def evaluate_points(
     uv, w_light, w_view : array_like, shape (..., 2), (..., 3), (..., 3)
     *scalars : array_like, shape (...)
         Further arguments of each lookup, such as a level of detail.
+    gathered : int
+        Values that ``lookup`` gathers for a point: with many, fewer points are done at a time.
 
     Returns
     -------
@@ -137,8 +150,9 @@ def evaluate_points(
     points += [np.broadcast_to(a, (*shape, a.shape[-1])).reshape(-1, a.shape[-1]) for a in vectors]
     points += [np.broadcast_to(a, shape).reshape(-1) for a in numbers]
     n, result = len(points[0]), None
-    for start in range(0, n, CHUNK):
-        part = [a[start : start + CHUNK] for a in points]
+    step = min(CHUNK, max(1, GATHERED // gathered))
+    for start in range(0, n, step):
+        part = [a[start : start + step] for a in points]
         valid = conventions.valid_directions(part[1]) & conventions.valid_directions(part[2])
         if not valid.any():
             continue
@@ -146,7 +160,7 @@ def evaluate_points(
         if result is None:
             # In the precision that the lookup kept: single, where :func:`computing_in` asks for it.
             result = np.zeros((n, 3), value.dtype)
-        result[start : start + CHUNK][valid] = value
+        result[start : start + step][valid] = value
     if result is None:
         result = np.zeros((n, 3), points[0].dtype)
     return result.reshape(*shape, 3)

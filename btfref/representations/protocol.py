@@ -271,8 +271,30 @@ class StatesMemory(Protocol):
     """A module that says how much memory its fit takes."""
 
     @property
-    def FIT_MEMORY(self) -> tuple[int, float]:  # noqa: N802 - a constant of a module
-        """Bytes at the peak: of blocks that do not grow, and per value of a BTF of half floats, itself included."""
+    def FIT_MEMORY(self) -> FitMemory:  # noqa: N802 - a constant of a module
+        """What it takes at its peak."""
+
+
+@dataclass(frozen=True)
+class FitMemory:
+    """What a fit takes at its peak, beside the interpreter.
+
+    Attributes
+    ----------
+    each : float
+        Bytes per value of a sampled BTF of half floats, the BTF itself included.
+    blocks : int
+        Bytes that do not grow with the BTF, for the default parameters.
+    scales : tuple of str
+        Parameters that the blocks are in proportion to, where they are larger than by default.
+    tables : tuple of str
+        Parameters whose product is the number of tables over pairs of directions, each with a weight for all texels.
+    """
+
+    each: float
+    blocks: int = 0
+    scales: tuple[str, ...] = ()
+    tables: tuple[str, ...] = ()
 
 
 @runtime_checkable

@@ -23,6 +23,7 @@ from btfref.representations.analytic import light_functions
 from btfref.representations.analytic.lobe_start import exponent_limit
 from btfref.representations.file.schema import LARGEST, MapSchema, Number, Range, Schema
 from btfref.representations.lookup import positive_integer, stored
+from btfref.representations.protocol import FitMemory
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = 220 << 20, 3.8
+FIT_MEMORY = FitMemory(3.8, 220 << 20, scales=("lobes",))
 
 #: "paper": Table 1's four lobes, in floats.
 PRESETS = {"paper": {"lobes": 4, "storage": "float"}}

@@ -16,6 +16,7 @@ from btfref.numerics.sphere.quadrature import gauss_hemisphere
 from btfref.representations.analytic import lafortune, light_functions
 from btfref.representations.file.schema import MapSchema, Schema
 from btfref.representations.lookup import positive_integer
+from btfref.representations.protocol import FitMemory
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = 220 << 20, 3.8
+FIT_MEMORY = FitMemory(3.8, 220 << 20, scales=("lobes",))
 
 #: "paper": Table 1's four lobes, in floats.
 PRESETS: dict[str, Facts] = {"paper": {"lobes": 4, "bounded": False, "storage": "float"}}

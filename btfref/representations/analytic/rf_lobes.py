@@ -29,6 +29,7 @@ from btfref.representations.analytic.lobe_start import (
 )
 from btfref.representations.file.schema import LARGEST, MapSchema, Number, Range, Schema
 from btfref.representations.lookup import positive_integer, stored
+from btfref.representations.protocol import FitMemory
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = 560 << 20, 3.6
+FIT_MEMORY = FitMemory(3.6, 560 << 20, scales=("lobes",))
 
 #: "paper": two lobes in floats.
 PRESETS = {"paper": {"lobes": 2, "storage": "float"}}

@@ -20,6 +20,7 @@ from btfref.precision import real
 from btfref.representations.analytic import light_functions
 from btfref.representations.file.schema import MapSchema, Schema
 from btfref.representations.lookup import stored
+from btfref.representations.protocol import FitMemory
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = 170 << 20, 3.8
+FIT_MEMORY = FitMemory(3.8, 170 << 20)
 
 #: "paper": all 81 views in floats.
 PRESETS = {"paper": {"storage": "float"}}

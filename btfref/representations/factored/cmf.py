@@ -42,6 +42,7 @@ from btfref.representations.factored.fit import (
 )
 from btfref.representations.factored.storage import Storing, fitted
 from btfref.representations.lookup import positive_integer
+from btfref.representations.protocol import FitMemory
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -54,7 +55,7 @@ if TYPE_CHECKING:
 __all__ = ["FIT_MEMORY", "PRESETS", "Representation", "fit"]
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = 0, 6.2
+FIT_MEMORY = FitMemory(6.2)
 
 #: "paper": factors as the chain leaves them, all in 8 bits, scales from the normalisation alone.
 PRESETS = {"paper": {"sweeps": 0, "rescale": False, "storage": "byte", "code": "linear"}}

@@ -25,6 +25,7 @@ from btfref.representations.factored.fit import (
     unit_tables,
 )
 from btfref.representations.factored.storage import Storing, fitted
+from btfref.representations.protocol import FitMemory
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 __all__ = ["FIT_MEMORY", "PRESETS", "Representation", "fit"]
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = 0, 6.2
+FIT_MEMORY = FitMemory(6.2)
 
 #: "paper": factors as the system leaves them, all in 8 bits, scales from the normalisation alone.
 PRESETS = {

@@ -14,11 +14,12 @@ from __future__ import annotations
 
 from btfref.representations.laplacian.fit import fit
 from btfref.representations.laplacian.levels import Representation
+from btfref.representations.protocol import FitMemory
 
 __all__ = ["FIT_MEMORY", "PRESETS", "Representation", "fit"]
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = 0, 18.5
+FIT_MEMORY = FitMemory(20.5)
 
 #: "paper": λ_max = 4, 8 + 2 + 2 components a level, Phong mean, 3 × 3 box, nearest texels and directions, in floats.
 PRESETS = {

@@ -17,7 +17,7 @@ from btfref.precision import real
 from btfref.representations.analytic.light_functions import EDGES, held
 from btfref.representations.file.schema import FLOATS, Constant, MapSchema, OneOf, Range, Schema
 from btfref.representations.guide import N_GROUPS, feature_views, group_means, texel_groups
-from btfref.representations.lookup import StoredMaps, evaluate_points, packed_arrays
+from btfref.representations.lookup import PAIRS, StoredMaps, evaluate_points, packed_arrays
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -113,7 +113,8 @@ class Representation(StoredMaps):
                 )
             return total @ real(TO_RGB.T)
 
-        return evaluate_points(lookup, uv, w_light, w_view, lod)
+        gathered = PAIRS * max([1, *(sum(level["components"]) for level in levels)])
+        return evaluate_points(lookup, uv, w_light, w_view, lod, gathered=gathered)
 
     def _mean(
         self,

@@ -21,6 +21,7 @@ from btfref.representations.file.resident import refuse_absent
 from btfref.representations.file.schema import INDICES, MapSchema, Number, Schema
 from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
+    PAIRS,
     StoredMaps,
     base_meta,
     direction_arrays,
@@ -30,7 +31,7 @@ from btfref.representations.lookup import (
     stored,
     unit_peaks,
 )
-from btfref.representations.protocol import Entries
+from btfref.representations.protocol import Entries, FitMemory
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = 0, 7.6
+FIT_MEMORY = FitMemory(7.6, tables=("clusters", "components"))
 
 #: "paper": the setting of the 2004 paper's timings, 16 clusters with a mean and 4 components, in floats.
 PRESETS = {"paper": {"clusters": 16, "components": 4, "storage": "float"}}
@@ -105,7 +106,7 @@ class Representation(StoredMaps):
             table = real(basis[index])  # n, t, v, l, component, channel: advanced axes come first
             return np.einsum("ntk,nvl,ntvlkc->nc", texel_coefficient, s.pair_weight, table, optimize=True)
 
-        return evaluate_tabulated(self, kernel, uv, w_light, w_view)
+        return evaluate_tabulated(self, kernel, uv, w_light, w_view, gathered=4 * PAIRS * 3 * basis.shape[1])
 
     def port_arrays(self) -> dict[str, np.ndarray]:
         """``basis`` [cluster, view, light, (1 + component) · 3]: one direction pair of one cluster is contiguous."""

@@ -20,6 +20,7 @@ from btfref.representations.lookup import (
     meta_for,
     refuse_not_finite,
 )
+from btfref.representations.protocol import FitMemory
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = 0, 6.6
+FIT_MEMORY = FitMemory(6.6)
 
 PRESETS: dict[str, Facts] = {"paper": {}}
 

@@ -17,6 +17,7 @@ from btfref.precision import real
 from btfref.representations.file.schema import MapSchema, Number, Schema
 from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
+    PAIRS,
     StoredMaps,
     base_meta,
     direction_arrays,
@@ -26,6 +27,7 @@ from btfref.representations.lookup import (
     stored,
     unit_peaks,
 )
+from btfref.representations.protocol import FitMemory
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -38,7 +40,7 @@ if TYPE_CHECKING:
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = 0, 6.8
+FIT_MEMORY = FitMemory(6.8, tables=("components",))
 
 #: Koudelka et al. keep 150 components for one texture; 16 cost a lookup about three times what local PCA's 4 cost.
 PRESETS = {"paper": {"components": 150, "storage": "float"}}
@@ -75,7 +77,7 @@ class Representation(StoredMaps):
             table = real(basis[:, s.view[:, :, None], s.light[:, None, :]])
             return np.einsum("nk,nvl,knvlc->nc", coefficient, s.pair_weight, table, optimize=True)
 
-        return evaluate_tabulated(self, kernel, uv, w_light, w_view)
+        return evaluate_tabulated(self, kernel, uv, w_light, w_view, gathered=PAIRS * 3 * len(basis))
 
     def port_arrays(self) -> dict[str, np.ndarray]:
         """``basis`` [view, light, component · 3]: one direction pair is contiguous."""

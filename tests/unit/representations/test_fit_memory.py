@@ -42,22 +42,48 @@ def test_a_budget_grows_with_the_values(key):
 
 def test_a_method_that_says_nothing_counts_as_a_large_one():
     silent = SimpleNamespace(key="silent", fitting=SimpleNamespace(fit=None, PRESETS={}))
-    blocks, each = UNKNOWN
-    assert least_budget(silent, store(1)) == FIT_BASE + blocks + int(3 * 81 * 81 * each)
+    assert least_budget(silent, store(1)) == FIT_BASE + int(UNKNOWN.blocks + 3 * 81 * 81 * UNKNOWN.each)
+
+
+@pytest.mark.parametrize(
+    ("key", "more"),
+    [
+        ("svd", {"components": 64}),
+        ("lpca", {"clusters": 64}),
+        ("rf_lobes", {"lobes": 4}),
+        ("lafortune", {"lobes": 6}),
+    ],
+)
+def test_a_larger_model_takes_more(key, more):
+    row = method(key)
+    assert least_budget(row, store(16), more) > least_budget(row, store(16))
+    # Fewer are no less: what a fit takes beside its model stays.
+    assert least_budget(row, store(16), dict.fromkeys(more, 1)) <= least_budget(row, store(16))
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("key", methods())
-def test_a_fit_keeps_its_budget(key, tmp_path, rng):
+@pytest.mark.parametrize(
+    ("key", "parameters"),
+    [
+        *((key, {}) for key in methods()),
+        ("svd", {"components": 150}),
+        ("lpca", {"clusters": 64, "components": 12}),
+        ("rf_lobes", {"lobes": 4}),
+        ("laplacian", method("laplacian").presets["paper"]),
+    ],
+)
+def test_a_fit_keeps_its_budget(key, parameters, tmp_path, rng):
     """In a process of its own, with the least budget that is let through."""
     grid = directions("ubo81")
     shades = rng.uniform(0.05, 0.5, (24, 24, 3))
     lobes = np.maximum(grid.vectors @ grid.vectors.T, 0) ** 4 + 0.3
     values = (lobes * grid.vectors[:, 2])[:, :, None, None, None] * shades
     SampledBTF(values.astype(np.float16), grid, grid).save(tmp_path / "x.btf.zarr")
-    budget = least_budget(method(key), store(24))
+    budget = least_budget(method(key), store(24), parameters)
+    given = [f"{name}={','.join(map(str, np.atleast_1d(value)))}" for name, value in parameters.items()]
     made = subprocess.run(
-        [sys.executable, "-m", "btfref", "fit", key, "x.btf.zarr", "-o", "x.exr", "--memory", str(budget)],
+        [sys.executable, "-m", "btfref", "fit", key, "x.btf.zarr", "-o", "x.exr", "--memory", str(budget)]
+        + (["--set", *given] if given else []),
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,

@@ -21,6 +21,7 @@ from btfref.representations.gbrdf.decomposition.reflectance import (
     texel_reflectance,
 )
 from btfref.representations.lookup import positive_integer, refuse_not_finite
+from btfref.representations.protocol import FitMemory
 
 if TYPE_CHECKING:
     from btfref.representations.gbrdf.definition import Representation
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 SIMILARITIES = ("reciprocity", "correlation")
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = 0, 5.0
+FIT_MEMORY = FitMemory(5.0)
 
 #: "paper": correlation in windows of 5 × 5 and depth weight 0.2 (section 6). The unit of the paper's smoothness, 0.1,
 #: is not given; in ours 0.1 flattens everything, 0.02 is the best for the correlation.
