@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from btfref.errors import InputError
 from btfref.sampling.variant import no_collection
 from btfref.scene import parsing
-from btfref.scene.reading.instances import every_shape
+from btfref.scene.reading.instances import Where, drawn_nodes, drawn_shapes
 from btfref.scene.shapes import refuse_partial_uv
 from btfref.types import JitArray, SceneLike
 
@@ -103,8 +103,8 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
             parsing.use_variant(self._before)
 
 
-def _btf_shapes(parsed: ParsedScene) -> dict[str, str]:
-    """Identifier → place of every shape with a BTF; to be asked before instantiation consumes the tree.
+def _btf_shapes(parsed: ParsedScene) -> list[tuple[Where, str, str]]:
+    """Every drawn shape with a BTF: which, its place, its name; to be asked before instantiation consumes the tree.
 
     Raises
     ------
@@ -116,20 +116,26 @@ def _btf_shapes(parsed: ParsedScene) -> dict[str, str]:
         materials = [child for _, child in parsed.children(node) if parsing.is_kind(child, "BSDF")]
         return any(node.props.plugin_name() == parsing.BTF or shows_btf(node) for node in materials)
 
-    shapes = [node for node in parsed.nodes if parsing.is_kind(node, "Shape") and shows_btf(node)]
-    for node in shapes:
-        if node.props.plugin_name() == "obj" and "filename" in node.props:
-            name = node.props.id() or "obj"
-            refuse_partial_uv(node.props["filename"], scene=parsed.location(node), name=name)
-    return {node.props.id(): parsed.location(node) for node in shapes}
+    roots = [(i, n) for i, n in parsed.children(parsed.state.root) if parsing.is_kind(n, "Shape")]
+    found = []
+    for drawn in drawn_nodes(parsed, roots):
+        props = drawn.node.props
+        if not shows_btf(drawn.node):
+            continue
+        # Not by identifiers: files need not give any, and all shapes then have the same.
+        name, place = drawn.name(props.id() or props.plugin_name()), parsed.location(drawn.node)
+        if props.plugin_name() == "obj" and "filename" in props:
+            refuse_partial_uv(props["filename"], scene=place, name=name)
+        found.append((drawn.where, place, name))
+    return found
 
 
-def _demand_texture_coordinates(made: JitArray, btf_shapes: dict[str, str]) -> None:
+def _demand_texture_coordinates(made: JitArray, btf_shapes: list[tuple[Where, str, str]]) -> None:
     """Refuse meshes with a BTF but no uv: Mitsuba would use the triangles' barycentric coordinates."""
-    for shape in every_shape(made):
-        if shape.id() in btf_shapes and shape.is_mesh() and not shape.has_vertex_texcoords():
-            place = btf_shapes[shape.id()]
-            raise InputError("the shape has no texture coordinates", file=place, field=shape.id())
+    shapes = drawn_shapes(made, [where for where, _, _ in btf_shapes])
+    for drawn, (_, place, name) in zip(shapes, btf_shapes, strict=True):
+        if drawn.shape.is_mesh() and not drawn.shape.has_vertex_texcoords():
+            raise InputError("the shape has no texture coordinates", file=place, field=name)
 
 
 def _plain_film(parsed: ParsedScene, index: int) -> None:

@@ -340,12 +340,26 @@ def test_files_that_are_no_scene(content, folder, capsys):
     refuse(folder, capsys, "realtime", "scene.xml", "-o", "out.exr", words=["scene.xml"])
 
 
-def test_scene_without_texture_coordinates(folder, capsys):
-    shape = SHAPE.replace('"rectangle">', '"ply" id="bare"><string name="filename" value="mesh.ply"/>')
+@pytest.mark.parametrize(("own", "word"), [('id="bare"', "bare"), ('name="elm__4"', "ply")])
+def test_scene_without_texture_coordinates(own, word, folder, capsys):
+    shape = SHAPE.replace('"rectangle">', f'"ply" {own}><string name="filename" value="mesh.ply"/>')
     (folder / "scene.xml").write_text(SCENE.format(sensor=SENSOR, shape=shape, light=LIGHT))
-    words = ["scene.xml", "bare", "texture coordinates"]
+    words = ["scene.xml", word, "texture coordinates"]
     refuse(folder, capsys, "realtime", "scene.xml", "-o", "out.exr", words=words)
     refuse(folder, capsys, "render", "scene.xml", "-o", "out.exr", "--grid", "1", words=words)
+
+
+@pytest.mark.parametrize("own", ['name="elm__4"', ""])
+def test_a_mesh_without_texture_coordinates_beside_a_btf(own, folder, need):
+    """Files that Blender writes give shapes names and no identifiers: what is one's BTF is none of the other's."""
+    need("llvm")
+    need("gl")
+    bare = f'<shape type="ply" {own}><string name="filename" value="mesh.ply"/><bsdf type="diffuse"/></shape>'
+    shape = bare + SHAPE.replace('"rectangle">', f'"rectangle" {own.replace("4", "6")}>')
+    (folder / "scene.xml").write_text(SCENE.format(sensor=SENSOR, shape=shape, light=LIGHT))
+    assert main(["render", "scene.xml", "-o", "reference.exr", "--grid", "1"]) == 0
+    assert main(["realtime", "scene.xml", "-o", "picture.exr", "--grid", "1"]) == 0
+    assert main(["compare", "picture.exr", "reference.exr"]) == 0
 
 
 def test_the_good_material_is_good(folder):
