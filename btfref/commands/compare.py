@@ -25,7 +25,7 @@ from btfref.commands.shared.options import (
     add_shadows,
     add_size,
 )
-from btfref.commands.shared.printing import GATE_HEADER, emit, emit_json, gate_cells, number, table
+from btfref.commands.shared.printing import GATE_HEADER, Progress, emit, emit_json, gate_cells, number, table
 from btfref.commands.shared.reading import assignments, output_file
 from btfref.errors import InputError
 
@@ -117,20 +117,22 @@ def _against_scene(args: Namespace, test: np.ndarray) -> tuple[Comparison, Facts
     shadows = args.shadows
     if shadows is None:
         shadows = bool((read_picture_facts(args.test) or {}).get("shadows"))
-    found = reference_of(
-        args.reference,
-        parameters=parameters,
-        size=size,
-        grid=args.grid,
-        shadows=shadows,
-        cache=args.cache,
-    )
+    with Progress() as progress:
+        found = reference_of(
+            args.reference,
+            parameters=parameters,
+            size=size,
+            grid=args.grid,
+            shadows=shadows,
+            cache=args.cache,
+            progress=progress,
+        )
     # Under an environment the reference is a plain rendering of the scene.
     noisy = found.variance is not None
     facts = {
         **scene_content(args.reference, parameters, size=size),
         "grid": None if noisy else args.grid,
-        "shadows": noisy or shadows,
+        "shadows": shadows,
     }
     return judge_image(args.test, found, gates=args.gate), facts
 

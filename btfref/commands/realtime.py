@@ -30,7 +30,7 @@ from btfref.commands.shared.options import (
     add_shadows,
     help_with_scenes,
 )
-from btfref.commands.shared.printing import emit, emit_json, say_area_lights
+from btfref.commands.shared.printing import Progress, emit, emit_json, say_area_lights
 from btfref.commands.shared.reading import assignments, count, output_file
 from btfref.errors import DIRECTIONS, InputError
 from btfref.rendering.environment_light import PATHS
@@ -102,19 +102,21 @@ def run(args: Namespace) -> int:
 
     out = output_file(args.output, ".exr")
     parameters = assignments(args.define, convert=str, option="-D")
-    result = btfref.realtime(
-        args.scene,
-        parameters=parameters,
-        grid=args.grid,
-        size=args.size,
-        keep=args.keep,
-        environment=args.environment,
-        lights=args.lights,
-        order=args.order,
-        window=args.window,
-        transfer=transfer_settings(args.transfer) if args.transfer else None,
-        shadows=args.shadows,
-    )
+    with Progress() as progress:
+        result = btfref.realtime(
+            args.scene,
+            parameters=parameters,
+            grid=args.grid,
+            size=args.size,
+            keep=args.keep,
+            environment=args.environment,
+            lights=args.lights,
+            order=args.order,
+            window=args.window,
+            transfer=transfer_settings(args.transfer) if args.transfer else None,
+            shadows=args.shadows,
+            progress=progress,
+        )
     facts = picture_facts(result, args.scene, parameters=parameters, size=args.size)
     write_images(result.image, out, facts, png=args.png)
     if args.json:

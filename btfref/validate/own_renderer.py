@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from btfref.comparison import compare
+from btfref.conventions import PixelClass
 from btfref.errors import InputError
 from btfref.images import load_image
 from btfref.provenance.code import code_of
@@ -19,7 +20,7 @@ from btfref.validate.cache import Cache, digest, key_of
 
 if TYPE_CHECKING:
     from btfref.comparison import Comparison
-    from btfref.types import Facts, PathLike
+    from btfref.types import Facts, PathLike, Progress
 
 
 #: Gates of a picture of linear radiance under delta lights; of one with 8 bits; of one under an environment.
@@ -30,8 +31,8 @@ LINEAR = (
 EIGHT_BIT = ("image.eight_bit", "image.eight_bit_silhouette")
 NOISY = ("image.equivalence",)
 
-#: Samples per pixel of the reference where it cannot be free of noise.
-SPP = 1024
+#: Most samples per pixel of a reference that cannot be free of noise: fewer where its gates are decided by then.
+SPP = 1 << 14
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +64,7 @@ def reference_of(
     shadows: bool = False,
     spp: int = SPP,
     cache: PathLike | None = None,
+    progress: Progress | None = None,
 ) -> Reference:
     """The reference picture of a scene, rendered once.
 
@@ -77,10 +79,12 @@ def reference_of(
     grid : int
         n of the n × n sub-pixel samples under delta lights, which leave no noise.
     shadows : bool
-        Cast shadows, under delta lights.
+        Cast shadows. Under an environment the scene as its file says with them, and direct light alone without.
     spp : int
-        Samples per pixel where other lights need random numbers.
+        Samples per pixel at most where other lights need random numbers.
     cache : path-like, optional
+    progress : callable, optional
+        ``progress(done, total, label)``.
 
     Returns
     -------
@@ -102,12 +106,13 @@ def reference_of(
         "representations": sorted(digest_of(file) for file in files),
         "size": size,
         "delta": description.environment is None,
-        "settings": [grid, shadows] if description.environment is None else [spp],
+        "settings": [grid if description.environment is None else spp, shadows],
         "code": code_of(__name__, *(read_info(file)["method"] for file in files)),
     }
 
     def save(target: Path) -> None:
-        np.savez_compressed(target, **_render(path, parameters, size, grid, shadows, spp, facts["delta"]))
+        asked = (size, grid, shadows, spp, facts["delta"])
+        np.savez_compressed(target, **_render(path, parameters, *asked, progress))
 
     store = Cache(cache)
     with np.load(store.get(key_of({"reference": facts}), ".reference.npz", save)) as stored:
@@ -123,7 +128,9 @@ def _render(
     shadows: bool,
     spp: int,
     delta: bool,
+    progress: Progress | None,
 ) -> Facts:
+    from btfref.rendering.offline.converged import converged
     from btfref.rendering.offline.reference import render
     from btfref.scene.pixel_classes import pixel_classes
 
@@ -132,7 +139,8 @@ def _render(
     made: Facts = {"classes": kinds}
     if delta:
         return made | {"image": render(path, grid=grid, shadows=shadows, **shared).image}
-    result = render(path, spp=spp, with_variance=True, **shared)
+    inside = kinds == PixelClass.INTERIOR
+    result = converged(path, inside, gate=NOISY, shadows=shadows, most=spp, progress=progress, **shared)
     return made | {"image": result.image, "variance": result.variance}
 
 

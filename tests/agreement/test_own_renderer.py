@@ -15,6 +15,7 @@ from btfref.errors import InputError
 from btfref.images import save_image
 from btfref.images.files import load_image
 from btfref.rendering.gl.realtime import realtime
+from btfref.rendering.picture import attributes
 from btfref.scene.shipped import scene_file
 from btfref.testing import assert_matches_reference
 from btfref.validate.own_renderer import Reference, judge_image, reference_of, representation_for
@@ -144,3 +145,24 @@ def test_in_the_test_suite_of_another_project(theirs, tmp_path):
     assert "1 failed, 2 passed" in done.stdout, done.stdout + done.stderr
     assert "image.noise_free.p999" in done.stdout
     assert len(list((tmp_path / "pages").glob("test_wrong.*.html"))) == 1
+
+
+def test_a_picture_without_shadows_under_a_sky(fits, tmp_path):
+    """A square hangs over another: direct light without shadows passes, and fails where the file says it has them."""
+    shared = "<bsdf type='btf'><string name='filename' value='{}'/></bsdf>".format(fits.path("lpca"))
+    scene = tmp_path / "roof.xml"
+    scene.write_text(f"""<scene version="3.0.0"><integrator type="path"/>
+        <sensor type="perspective"><float name="fov" value="40"/><transform name="to_world">
+            <lookat origin="0,-3,2" target="0,0,0" up="0,0,1"/></transform>
+            <film type="hdrfilm"><integer name="width" value="20"/><integer name="height" value="20"/></film></sensor>
+        <emitter type="constant"/><shape type="rectangle">{shared}</shape>
+        <shape type="rectangle"><transform name="to_world"><scale value="0.5"/><translate z="0.3"/></transform>{shared}
+        </shape></scene>""")
+    result = realtime(scene, grid=2)
+    for shadows in (False, True):
+        facts = {"renderer": "realtime", "grid": 2, "shadows": shadows}
+        save_image(tmp_path / f"{shadows}.exr", result.image, attributes=attributes(facts))
+    kept = {"cache": tmp_path / "cache"}
+    assert assert_matches_reference(tmp_path / "False.exr", scene, **kept).passed
+    with pytest.raises(AssertionError, match=r"image\.equivalence"):
+        assert_matches_reference(tmp_path / "True.exr", scene, **kept)

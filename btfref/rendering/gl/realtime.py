@@ -21,7 +21,7 @@ from btfref.scene.demand import MARGIN, kept_maps, number_kept
 from btfref.scene.description import SceneDescription, read_scene
 from btfref.scene.mirrored import mirrored_meshes
 from btfref.scene.shadows.occluders import has_occluders
-from btfref.types import SceneLike
+from btfref.types import Progress, SceneLike
 
 if TYPE_CHECKING:
     from btfref.rendering.environment_light.transfer import TransferSettings
@@ -43,6 +43,7 @@ def realtime(
     transfer: TransferSettings | None = None,
     shadows: bool | None = None,
     count_fetches: bool = False,
+    progress: Progress | None = None,
 ) -> RenderResult:
     """Render a scene with OpenGL.
 
@@ -74,6 +75,8 @@ def realtime(
         but by the way "transfer".
     count_fetches : bool
         Count the texels that the representations fetch: ``meta["fetches"]``, the mean over covered samples.
+    progress : callable, optional
+        ``progress(done, total, label)``, after each frame.
 
     Returns
     -------
@@ -118,7 +121,9 @@ def realtime(
         offsets = [((i + 0.5) / grid, (j + 0.5) / grid) for j in range(grid) for i in range(grid)]
         total = np.zeros((scene.camera.height, scene.camera.width, 3))
         times, fetches = [], []
-        for offset in offsets:
+        for number, offset in enumerate(offsets):
+            if progress:
+                progress(number, len(offsets), "frames")
             times.append(renderer.draw(offset, share=1 / grid))
             total += renderer.read()
             if count_fetches:
@@ -127,7 +132,8 @@ def realtime(
         meta = {
             "renderer": "realtime",
             "grid": grid,
-            "shadows": shadows,
+            # Transfer carries the environment's own shadows.
+            "shadows": shadows or bool(renderer.transfers and transfer is not None and transfer.shadows),
             **renderer.shadow_facts,
             "frame_ms": float(np.median(times)),
             "negative_fraction": float((image < 0).mean()),
