@@ -5,12 +5,12 @@ from __future__ import annotations
 import base64
 import json
 from functools import cache
-from importlib.resources import files
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.errors import BtfrefError
+from btfref.rendering.ports.folder import webgl_script
 from btfref.rendering.web import chromium
 from btfref.types import Facts
 
@@ -20,11 +20,6 @@ if TYPE_CHECKING:
 
 #: What the name of the renderer must hold: any other one (a GPU, say) is not what the figures were measured on.
 RENDERER = "SwiftShader"
-
-
-def script() -> str:
-    """The JavaScript that reads port packages."""
-    return files("btfref.rendering.ports").joinpath("webgl2.js").read_text("utf-8")
 
 
 class Device:
@@ -46,7 +41,7 @@ class Device:
         self.page = browser.page()
         try:
             self.page.evaluate(before)
-            self.page.evaluate(f"{script()}; globalThis.BtfPort = BtfPort; 0")
+            self.page.evaluate(f"{webgl_script()}; globalThis.BtfPort = BtfPort; 0")
             self.page.evaluate("globalThis.gl = BtfPort.connect(new OffscreenCanvas(1, 1)); 0")
             self.renderer = str(self.page.evaluate("BtfPort.renderer(gl)"))
             if RENDERER not in self.renderer:
