@@ -146,6 +146,12 @@ def read_only(folder, patch):
     patch.setattr("btfref.commands.shared.reading.os.access", lambda *_: False)
 
 
+def few_samplers(folder, patch):
+    patch.setattr("btfref.rendering.ports.package.MOST_SAMPLERS", 1)
+
+
+PORT = "export good.exr --format gl -o"
+
 RENDER, REALTIME = "render good.xml -o out.exr --grid 1", "realtime good.xml -o out.exr"
 
 ROWS = [
@@ -343,7 +349,22 @@ ROWS = [
         "packages", "of another type", "fit odd good.btf.zarr -o out.exr", ("odd",), prepare=points(odd=dict)
     ),
     Row("packages", "no such exporter", "export good.btf.zarr --format gone -o new", ("ubo", "utia", "bonn")),
-]
+    Row("ports", "a sampled BTF", f"{PORT.replace('.exr', '.btf.zarr')} new", ("good.btf.zarr",)),
+    Row("ports", "a picture", f"{PORT.replace('good', 'image')} new", ("image.exr", "representation")),
+    Row("ports", "no such file", f"{PORT.replace('good', 'none')} new", ("none.exr",)),
+    Row("ports", "a folder there", f"{PORT} good.btf.zarr", ("exists already",)),
+    Row("ports", "no folder for it", f"{PORT} none/new", ("no such folder", "none")),
+    Row("ports", "settings", f"{PORT} new --quality 3", ("gl takes no settings", "quality")),
+    Row(
+        "ports", "NaN", f"{PORT} new", ("values", "good.exr"),
+        prepare=with_array("values", lambda a: a * np.float32(np.nan)),
+    ),
+    Row("ports", "too many textures", f"{PORT} new", ("textures", "at most 1"), prepare=few_samplers),
+    Row(
+        "ports", "disk full", f"{PORT} new", ("No space left",),
+        prepare=failing("btfref.rendering.ports.folder.ktx2", OSError(errno.ENOSPC, "No space left on device")),
+    ),
+]  # fmt: skip
 
 
 def _full_once(folder, patch):
