@@ -30,17 +30,21 @@ REPRESENTATION = "representation"
 #: The placeholder for the way that an environment lights it; empty where none does.
 ENVIRONMENT = "environment"
 
-#: Version line and precision statements of the two dialects: desktop OpenGL 3.3 and OpenGL ES 3.0 (WebGL 2).
+#: Version lines of the two dialects: desktop OpenGL 3.3 and OpenGL ES 3.0 (WebGL 2).
+VERSIONS = {"330 core": "#version 330 core\n", "300 es": "#version 300 es\n"}
+
 #: ES has no default precision for these types in fragment shaders, and lowp for samplers.
-TARGETS = {
-    "330 core": "#version 330 core\n",
-    "300 es": "#version 300 es\n"
+ES_PRECISION = (
     "precision highp float;\nprecision highp int;\n"
-    "precision highp sampler2DArray;\nprecision highp usampler2DArray;\n",
-}
+    "precision highp sampler2DArray;\nprecision highp usampler2DArray;\n"
+)
+
+#: What a shader of each dialect begins with.
+TARGETS = {"330 core": VERSIONS["330 core"], "300 es": VERSIONS["300 es"] + ES_PRECISION}
 
 _INCLUDE = re.compile(r'^\s*#\s*include\s+"([^"\n]+)"\s*(?://.*)?$')
 _LOOKS_LIKE_INCLUDE = re.compile(r"^\s*#\s*include\b")
+_LINE = re.compile(r"#line (\d+) (\d+)")
 _CONDITIONAL = re.compile(r"^\s*#\s*(if|endif)")
 _IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 # "0(12) : error", "0:12(5): error" (Mesa), "ERROR: 0:12:" (glslang)
@@ -159,6 +163,27 @@ def compose(
     source = ShaderSource(TARGETS[target] + define_block(defines or {}) + "\n".join(body) + "\n")
     source.files = tuple(files)
     return source
+
+
+def portable(source: ShaderSource) -> str:
+    """One text for both dialects, without a version line: whoever compiles it puts one of :data:`VERSIONS` before it.
+
+    Parameters
+    ----------
+    source : ShaderSource
+        Composed for ``330 core``.
+
+    Returns
+    -------
+    str
+        Comments name the files in place of ``#line``, whose numbers mean nothing elsewhere.
+    """
+    lines = source.removeprefix(TARGETS["330 core"]).splitlines()
+    for position, line in enumerate(lines):
+        if match := _LINE.fullmatch(line):
+            lines[position] = f"// {source.files[int(match[2])]}" if match[1] == "1" else ""
+    text = "\n".join(lines)
+    return f"#ifdef GL_ES\n{ES_PRECISION}#endif\n{text}\n"
 
 
 def _find(name: str, search: Sequence[Path], asked_by: str | None) -> Path:

@@ -68,6 +68,64 @@ def facts(ctx: JitArray) -> dict[str, str]:
     return {key: ctx.info[name] for key, name in names.items()}
 
 
+@dataclass(frozen=True)
+class FoldedTable:
+    """A table as the texels of a 2D array texture, without a context.
+
+    Parameters
+    ----------
+    width, height, layers : int
+        Texel i is at x = i mod 4096, y = (i div 4096) mod 4096, layer = i div 4096²; a short table is narrower.
+    values : ndarray, shape (layers * height * width * 4,)
+        RGBA, zeros beyond the table's end.
+    """
+
+    width: int
+    height: int
+    layers: int
+    values: np.ndarray
+
+
+def folded(array: np.ndarray, name: str) -> FoldedTable:
+    """The texels of a table, in C order.
+
+    Parameters
+    ----------
+    array : ndarray of float16, float32, uint32 or uint8 (normalized), shape (..., k)
+        k is a multiple of 4.
+    name : str
+        For error messages.
+
+    Returns
+    -------
+    FoldedTable
+
+    Raises
+    ------
+    InputError
+        For another type or shape, or more texels than shaders can count.
+    """
+    if array.dtype.name not in _DTYPES or array.shape[-1] % 4 or not array.size:
+        raise InputError(
+            "a table that GLSL cannot read",
+            field=name,
+            got=f"{array.dtype} {array.shape}",
+            expected=f"{', '.join(_DTYPES)}, last axis a multiple of 4",
+        )
+    texels = array.size // 4
+    if texels > np.iinfo(np.int32).max:
+        raise InputError("a table is too large for a shader", field=name, got=f"{texels} RGBA texels")
+    width = min(texels, TABLE_WIDTH)
+    rows = -(-texels // width)
+    layers = -(-rows // TABLE_WIDTH)
+    height = min(rows, TABLE_WIDTH)
+    flat = np.ascontiguousarray(array).reshape(-1)
+    padded = layers * height * width * 4
+    if padded != flat.size:
+        flat = np.concatenate([flat, np.zeros(padded - flat.size, flat.dtype)])
+    return FoldedTable(width, height, layers, flat)
+
+
 def upload(ctx: JitArray, array: np.ndarray, name: str) -> JitArray:
     """A table as an array texture of RGBA texels in C order.
 
@@ -82,33 +140,20 @@ def upload(ctx: JitArray, array: np.ndarray, name: str) -> JitArray:
     Returns
     -------
     moderngl.TextureArray
-        4096 texels wide; texel i is at x = i mod 4096, y = (i div 4096) mod 4096, layer = i div 4096².
+        As :func:`folded` lays it out.
 
     Raises
     ------
     InputError
         For another type or shape, or a table larger than the driver's textures.
     """
-    dtype = _DTYPES.get(array.dtype.name)
-    if dtype is None or array.shape[-1] % 4 or not array.size:
-        raise InputError(
-            "a table that GLSL cannot read",
-            field=name,
-            got=f"{array.dtype} {array.shape}",
-            expected=f"{', '.join(_DTYPES)}, last axis a multiple of 4",
-        )
-    texels = array.size // 4
-    rows = -(-texels // TABLE_WIDTH)
-    layers = -(-rows // TABLE_WIDTH)
-    height = min(rows, TABLE_WIDTH)
+    table = folded(array, name)
     limit = ctx.info["GL_MAX_ARRAY_TEXTURE_LAYERS"]
-    if layers > limit or texels > np.iinfo(np.int32).max:
-        raise InputError("a table is too large for this driver", field=name, got=f"{texels} RGBA texels")
-    flat = np.ascontiguousarray(array).reshape(-1)
-    padded = layers * height * TABLE_WIDTH * 4
-    if padded != flat.size:
-        flat = np.concatenate([flat, np.zeros(padded - flat.size, flat.dtype)])
-    texture = ctx.texture_array((TABLE_WIDTH, height, layers), 4, flat.data, dtype=dtype)
+    if table.layers > limit:
+        got = f"{table.layers} layers of {TABLE_WIDTH}² RGBA texels"
+        raise InputError("a table is too large for this driver", field=name, got=got, expected=limit)
+    size = (table.width, table.height, table.layers)
+    texture = ctx.texture_array(size, 4, table.values.data, dtype=_DTYPES[array.dtype.name])
     # Unfiltered, without mipmaps: texelFetch of an incomplete texture would return zeros.
     texture.filter = (ctx.NEAREST, ctx.NEAREST)
     return texture
@@ -161,12 +206,8 @@ class ShaderRepresentation:
         light : btfref.rendering.environment_light.prepared.Prepared, optional
             How an environment lights it: its tables come along.
         """
-        defines = shader_defines(rep, filter_type=filter_type)
+        arrays, defines = shader_tables(rep, filter_type=filter_type, light=light)
         shader, directories = shader_file(rep)
-        arrays = rep.port_arrays()
-        if light is not None:
-            defines |= light_defines(light.tables, light.constants)
-            arrays = {**arrays, **packed_arrays(light.tables)}
         textures = {name: upload(ctx, array, name) for name, array in arrays.items()}
         rows, columns = rep.meta.get("texels", (1, 1))
         return cls(textures, defines, shader, directories, (rows, columns), light.shader if light else None)
@@ -196,6 +237,17 @@ class ShaderRepresentation:
         """Give the textures back."""
         for texture in self.textures.values():
             texture.release()
+
+
+def shader_tables(
+    rep: Representation, *, filter_type: str | None = None, light: Prepared | None = None
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """What a representation's shader reads: tables by sampler name, and constants; those of a light come along."""
+    arrays, defines = rep.port_arrays(), shader_defines(rep, filter_type=filter_type)
+    if light is not None:
+        defines |= light_defines(light.tables, light.constants)
+        arrays = {**arrays, **packed_arrays(light.tables)}
+    return arrays, defines
 
 
 def shader_defines(rep: Representation, *, filter_type: str | None = None) -> dict[str, Any]:

@@ -1,5 +1,5 @@
 // Provides table_fetch: reads RGBA texel i of a linear list that is folded into a 2D array texture.
-// Expects a texture 4096 texels wide and, if more than one layer, 4096 high, written by btfref.rendering.gl.device.
+// Expects a texture of up to 4096 texels a row and 4096 rows a layer (full where more follow), written by btfref.rendering.gl.device.
 
 // Texels fetched so far, where COUNT_FETCHES is defined to report them.
 #ifdef COUNT_FETCHES

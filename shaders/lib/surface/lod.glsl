@@ -9,14 +9,8 @@ uniform float lod_unit;     // distance at which the level of detail is 0; 0 lea
 uniform float lod_bias;
 uniform vec2 lod_texels;    // columns and rows of level 0
 
-const float LOD_TINY = 1e-30;  // squared lengths below this count as this
-
-// The same numbers as btfref/numerics/footprint.py, where they are derived.
-const float LOD_ANISOTROPY = 7.0;
-const float LOD_BLUR = 5.0;
-
 // A disk of diameter angle * distance across the ray, stretched by 1/cos(theta) along the ray's projection, is an
-// ellipse of texels (Heckbert 1986). Lookups at the level of its shorter axis are spread along the longer one.
+// ellipse of texels (Heckbert 1986).
 float lod_of(SurfacePoint point, vec3 uv_row0, vec3 uv_row1, vec3 towards, float distance) {
     if (lod_unit > 0.0) {
         return lod_bias + log2(clamp(distance / lod_unit, LOD_TINY, 1e30));
@@ -32,12 +26,5 @@ float lod_of(SurfacePoint point, vec3 uv_row0, vec3 uv_row1, vec3 towards, float
     float uu = square * (dot(u, u) + along_u * along_u * stretch);
     float vv = square * (dot(v, v) + along_v * along_v * stretch);
     float uv = square * (dot(u, v) + along_u * along_v * stretch);
-    float difference = 0.5 * (uu - vv);
-    float longer = max(0.5 * (uu + vv) + sqrt(difference * difference + uv * uv), LOD_TINY);
-    float shorter = max(uu * vv - uv * uv, LOD_TINY) / longer;
-    footprint_ratio = sqrt(clamp(longer / max(shorter, LOD_TINY), 1.0, LOD_ANISOTROPY * LOD_ANISOTROPY));
-    square = longer / (footprint_ratio * footprint_ratio);
-    vec2 axis = uu >= vv ? vec2(longer - vv, uv) : vec2(uv, longer - uu);
-    footprint_step = axis * sqrt(square / max(dot(axis, axis), LOD_TINY)) / lod_texels;
-    return lod_bias + 0.5 * log2(1.0 + square / LOD_BLUR);
+    return lod_bias + footprint_level(uu, vv, uv, lod_texels);
 }
