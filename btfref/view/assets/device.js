@@ -67,16 +67,16 @@ class Device {
       uint32: [gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT],
       uint8: [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE],
     }[type];
-    const rows = Math.ceil(values.length / 4 / TABLE_WIDTH);
+    const texels = values.length / 4, width = Math.min(texels, TABLE_WIDTH), rows = Math.ceil(texels / width);
     const height = Math.min(rows, TABLE_WIDTH), layers = Math.ceil(rows / TABLE_WIDTH);
     let padded = values;
-    if (values.length < TABLE_WIDTH * height * layers * 4) {
-      padded = new values.constructor(TABLE_WIDTH * height * layers * 4);
+    if (texels < width * height * layers) {
+      padded = new values.constructor(width * height * layers * 4);
       padded.set(values);
     }
     const texture = gl.createTexture(), target = gl.TEXTURE_2D_ARRAY;
     gl.bindTexture(target, texture);
-    gl.texImage3D(target, 0, internal, TABLE_WIDTH, height, layers, 0, format, kind, padded);
+    gl.texImage3D(target, 0, internal, width, height, layers, 0, format, kind, padded);
     gl.texParameteri(target, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
     gl.texParameteri(target, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
     return { texture, target };
