@@ -73,6 +73,9 @@ LLVM = Requirement(
     f"LLVM {MINIMUM_LLVM} or later", (DEFAULT_LLVM_PACKAGE,), lambda: choose_llvm().path is not None
 )
 
+#: For WebGL 2; the tests also open reports in it.
+CHROMIUM = Requirement("Chromium", ("chromium",), lambda: chromium() is not None, True)
+
 REQUIREMENTS = (
     LLVM,
     # Dr.Jit's extension links against it; GCC's runtime libraries of a minimal system lack it.
@@ -84,7 +87,7 @@ REQUIREMENTS = (
     Requirement(
         "glslangValidator", ("glslang-tools",), lambda: shutil.which("glslangValidator") is not None, True
     ),
-    Requirement("Chromium", ("chromium",), lambda: chromium() is not None, True),
+    CHROMIUM,
 )
 
 

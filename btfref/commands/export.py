@@ -1,7 +1,10 @@
-"""Write a sampled BTF in a format of others, or the maps of a representation as images.
+"""Write a sampled BTF in a format of others, or a representation for other programs.
 
-ubo: pictures named as UBO2003's, in a folder or .zip; utia: likewise as UTIA's; bonn: a .btf file, factored (DFMF) or
-as it is (BDI); maps: a folder of OpenEXR images. Losses and clipped values are reported.
+Of a sampled BTF: ubo: pictures named as UBO2003's, in a folder or .zip; utia: likewise as UTIA's; bonn: a .btf file,
+factored (DFMF) or as it is (BDI). Losses and clipped values are reported. Of a representation: maps: a folder of
+OpenEXR images; gl: a folder with its shader, textures and known answers, for renderers with OpenGL 3.3 or WebGL 2.
+
+  btfref export checker.lpca.exr --format gl -o port
 """
 
 from __future__ import annotations
@@ -34,14 +37,14 @@ OUTPUTS = {"output": ""}
 def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
     parser.add_argument(
-        "btf", metavar="BTF", help="sampled BTF (.btf.zarr), or representation (.exr) for maps"
+        "btf", metavar="BTF", help="sampled BTF (.btf.zarr), or representation (.exr) for maps and gl"
     )
     parser.add_argument("-o", "--output", required=True, metavar="OUT", help="folder, .zip or .btf to write")
     parser.add_argument(
         "--format",
         required=True,
         metavar="NAME",
-        help="whose files to write: ubo, utia, bonn, maps, or a format that an installed package brings",
+        help="whose files to write: ubo, utia, bonn, maps, gl, or a format that an installed package brings",
     )
     parser.add_argument(
         "--set", nargs="+", action="extend", metavar="KEY=VALUE", help="settings of such a format"
@@ -75,18 +78,23 @@ def run(args: Namespace) -> int:
     from btfref.sampling import memory
 
     with Progress() as progress:
-        if args.format == "maps":
-            from btfref.formats.maps import export_maps
-
+        if args.format in ("maps", "gl"):
             if settings:
-                raise InputError("maps take no settings", field=next(iter(settings)))
-            facts = export_maps(args.btf, out)
+                raise InputError(f"{args.format} takes no settings", field=next(iter(settings)))
+            if args.format == "maps":
+                from btfref.formats.maps import export_maps
+
+                facts = export_maps(args.btf, out)
+            else:
+                from btfref.stress.known_answers import export_port
+
+                facts = export_port(args.btf, out, progress=progress)
         else:
             from btfref.formats import export_btf, exporters, format_named, names
             from btfref.sampling import open_store
 
             if args.format not in names() or format_named(args.format).export is None:
-                known = ", ".join([*exporters(), "maps"])
+                known = ", ".join([*exporters(), "maps", "gl"])
                 raise InputError("no such format to write", field="--format", got=args.format, expected=known)
 
             facts = export_btf(

@@ -195,7 +195,7 @@ def valid_lookups(lookups: Lookups) -> np.ndarray:
 
 
 def rounded_range(
-    representation: Representation, lookups: Lookups, ulps: float
+    representation: Representation, lookups: Lookups, ulps: float, *, neighbours: int = NEIGHBOURS
 ) -> tuple[np.ndarray, np.ndarray]:
     """Least and largest value of the definition at arguments that are off by their rounding.
 
@@ -212,7 +212,7 @@ def rounded_range(
     uv = np.where(np.isfinite(uv), uv, 0.0)
     # A tile far out is a tile: its own rounding is in the argument already, which is exact.
     low = high = representation.evaluate(uv, w_light, w_view, lod=lookups.lod)
-    for _ in range(NEIGHBOURS):
+    for _ in range(neighbours):
         # Sizes over many decades: next to the horizon a change of the last digit turns a ray as far as one of the
         # first.
         moved = [

@@ -1,0 +1,1 @@
+"""The same shaders in a browser: Chromium without a window, WebGL 2, numbers read back as floats."""

@@ -1,0 +1,136 @@
+"""Evaluation of a representation by its port package in Chromium's WebGL 2, point by point."""
+
+from __future__ import annotations
+
+import base64
+import json
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from btfref.errors import BtfrefError
+from btfref.rendering.ports.folder import webgl_script
+from btfref.rendering.web import chromium
+from btfref.types import Facts
+
+if TYPE_CHECKING:
+    from btfref.rendering.ports.package import PortPackage
+    from btfref.rendering.web.chromium import Browser
+
+#: What the name of the renderer must hold: any other one (a GPU, say) is not what the figures were measured on.
+RENDERER = "SwiftShader"
+
+
+class Device:
+    """A WebGL 2 context of a page.
+
+    Parameters
+    ----------
+    browser : btfref.rendering.web.chromium.Browser
+    before : str
+        JavaScript that runs first: what tests break is broken here.
+
+    Raises
+    ------
+    BtfrefError
+        Without WebGL 2, or with another renderer than :data:`RENDERER`.
+    """
+
+    def __init__(self, browser: Browser, before: str = "") -> None:
+        self.page = browser.page()
+        try:
+            self.page.evaluate(before)
+            self.page.evaluate(f"{webgl_script()}; globalThis.BtfPort = BtfPort; 0")
+            self.page.evaluate("globalThis.gl = BtfPort.connect(new OffscreenCanvas(1, 1)); 0")
+            self.renderer = str(self.page.evaluate("BtfPort.renderer(gl)"))
+            if RENDERER not in self.renderer:
+                raise BtfrefError(f"the browser draws with {self.renderer}, not with {RENDERER}")
+        except BaseException:
+            self.page.close()
+            raise
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """Renderer and browser, as a dict of str."""
+        return {"webgl_renderer": self.renderer, "browser": self.page.browser.version}
+
+
+@cache
+def _kept() -> list[Device]:
+    return []
+
+
+def device() -> Device:
+    """The process's WebGL 2 context: a new one after an error, which may have cost the last one.
+
+    Raises
+    ------
+    MissingDependencyError
+        Without Chromium.
+    BtfrefError
+    """
+    if not _kept():
+        _kept().append(Device(chromium.shared()))
+    return _kept()[0]
+
+
+class WebProbe:
+    """Lookups of a package in the browser; a context manager.
+
+    Parameters
+    ----------
+    package : btfref.rendering.ports.package.PortPackage
+    rows : ndarray of float32, shape (N, 9)
+        As of :func:`btfref.rendering.gl.probe.broadcast_points`; N at least 1.
+    where : Device, optional
+        Default: the process's own.
+    """
+
+    def __init__(self, package: PortPackage, rows: np.ndarray, where: Device | None = None) -> None:
+        self._own = where is None
+        self._device = device() if where is None else where
+        text = base64.b64encode(np.ascontiguousarray(rows, "<f4").tobytes()).decode("ascii")
+        self._do(f"globalThis.port = BtfPort.open(gl, {json.dumps(package.embedded())}); 0")
+        self._do(
+            f"globalThis.lookups = BtfPort.prepare(gl, port, new Float32Array(BtfPort.decode('{text}').buffer)); 0"
+        )
+
+    def __enter__(self) -> WebProbe:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is None:
+            self._do("BtfPort.release(lookups); BtfPort.close(gl, port); 0")
+
+    def _do(self, expression: str) -> Facts:
+        try:
+            return self._device.page.evaluate(expression)
+        except BtfrefError:
+            if self._own:
+                _kept().clear()
+            raise
+
+    def run(self) -> None:
+        """Evaluate all lookups, and wait."""
+        self._do("BtfPort.run(lookups); 0")
+
+    def _read(self) -> Facts:
+        return self._do(
+            "(() => { const found = BtfPort.read(lookups);"
+            " return { values: BtfPort.encode(found.values), malformed: found.malformed }; })()"
+        )
+
+    def values(self) -> np.ndarray:
+        """What the last run found, float32 (N, 3).
+
+        Raises
+        ------
+        BtfrefError
+            For a lost device or a blank frame.
+        """
+        return np.frombuffer(base64.b64decode(self._read()["values"]), "<f4").reshape(-1, 3).copy()
+
+    def malformed(self) -> dict[str, int]:
+        """How many lookups the shader called malformed in the last run, by kind."""
+        return dict(zip(("directions", "coordinates"), self._read()["malformed"], strict=True))
