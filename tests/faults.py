@@ -146,6 +146,14 @@ def read_only(folder, patch):
     patch.setattr("btfref.commands.shared.reading.os.access", lambda *_: False)
 
 
+def folder_there(folder, patch):
+    (folder / "folder.html").mkdir()
+
+
+def bare_mesh(folder, patch):
+    (folder / "bare.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+
+
 RENDER, REALTIME = "render good.xml -o out.exr --grid 1", "realtime good.xml -o out.exr"
 
 ROWS = [
@@ -343,6 +351,22 @@ ROWS = [
         "packages", "of another type", "fit odd good.btf.zarr -o out.exr", ("odd",), prepare=points(odd=dict)
     ),
     Row("packages", "no such exporter", "export good.btf.zarr --format gone -o new", ("ubo", "utia", "bonn")),
+    # 9
+    Row("view", "a picture", "view image.exr -o page.html", ("image.exr", "representation")),
+    Row("view", "no such file", "view gone.exr -o page.html", ("gone.exr",)),
+    Row("view", "no page", "view good.exr -o page.txt", (".html",)),
+    Row("view", "its input", "view good.exr -o good.exr", ("input",)),
+    Row("view", "another page's place", "view good.exr -o folder.html", ("folder",), prepare=folder_there),
+    Row("view", "no such mesh", "view good.exr --mesh gone.obj -o page.html", ("gone.obj",)),
+    Row(
+        "view",
+        "a mesh without texture coordinates",
+        "view good.exr --mesh bare.obj -o page.html",
+        ("bare.obj", "texture coordinates"),
+        prepare=bare_mesh,
+    ),
+    Row("view", "no such port", "view good.exr --port 99999", ("65535",)),
+    Row("view", "more files than a page has", f"view {'good.exr ' * 9}-o page.html", ("at most 8",)),
 ]
 
 
