@@ -356,7 +356,7 @@ ROWS = [
     Row("view", "no such file", "view gone.exr -o page.html", ("gone.exr",)),
     Row("view", "no page", "view good.exr -o page.txt", (".html",)),
     Row("view", "its input", "view good.exr -o good.exr", ("input",)),
-    Row("view", "another page's place", "view good.exr -o folder.html", ("folder",), prepare=folder_there),
+    Row("view", "a folder there", "view good.exr -o folder.html", ("folder",), prepare=folder_there),
     Row("view", "no such mesh", "view good.exr --mesh gone.obj -o page.html", ("gone.obj",)),
     Row(
         "view",

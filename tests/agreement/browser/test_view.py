@@ -5,8 +5,9 @@ import pytest
 
 from btfref.cli import main
 from btfref.gates import tolerance
+from btfref.registry import methods
 from btfref.rendering.web import chromium
-from btfref.view import mesh_shape, shipped_shapes
+from btfref.view import Material, mesh_shape, shipped_shapes, write_page
 
 #: A quad whose texture is mirrored: the v of OBJ files is turned over, as Mitsuba does it, so that it falls along y.
 MIRRORED = """v -1 -1 0
@@ -154,7 +155,7 @@ def seen(shape, pixel, size):
     return shape.tiling * (weight @ uv[number]), np.stack([s, t, n]), unit(-ray)
 
 
-def radiance(rep, shape, pixel, size, lights):
+def radiance(rep, shape, pixel, size, lights, lod=0.0):
     """Radiance of a pixel by the definition; lights are (azimuth, elevation, irradiance)."""
     uv, frame, towards = seen(shape, pixel, size)
     w_view, total = frame @ towards, 0.0
@@ -162,7 +163,7 @@ def radiance(rep, shape, pixel, size, lights):
     for azimuth, elevation, power in lights:
         a, e = np.radians([azimuth, elevation])
         light = frame @ [np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)]
-        total = total + np.array(power) * rep.evaluate(uv, side * light, side * w_view)
+        total = total + np.array(power) * rep.evaluate(uv, side * light, side * w_view, lod=lod)
     return total
 
 
@@ -189,6 +190,30 @@ def test_the_picture_is_what_numpy_says(visit, fits, mirrored):
     assert compared == 32
     frame = np.array(visit.see("viewer.pick(0.5, 0.5).at.frame"))  # of the mirrored quad
     assert np.abs(frame - np.diag([1.0, -1.0, 1.0])).max() <= tolerance("view.frame.max_abs")
+
+
+@pytest.mark.long
+def test_every_method_is_drawn_as_numpy_says(need, fits, tmp_path):
+    """Without derivatives: the level of detail is the page's own, and the definition is asked at it."""
+    need("chromium")
+    keys, (plane, *_) = list(methods()), shipped_shapes()
+    page = write_page(tmp_path / "all.html", [Material(key, fits(key)) for key in keys], [plane])
+    with chromium.shared().page() as opened:
+        visit = Visit(opened)
+        visit.size(860, 300)
+        opened.go(page.as_uri())
+        visit.settle()
+        visit.see("viewer.act.set('mode', 'one')")
+        size = visit.see("viewer.painter.size")
+        pixel = [int(0.5 * size[0]), int(0.5 * size[1])]
+        found = visit.see(f"viewer.painter.pick({pixel[0]}, {pixel[1]}, [...viewer.data.materials.keys()])")
+        lod, lights = found["at"]["lod"], [(-35, 50, [np.pi] * 3)]
+        for key, value in zip(keys, found["radiance"], strict=True):
+            # Lookups along the footprint are the shaders' own: the pixel sees one texel of a plane from near.
+            expected = radiance(fits(key), plane, pixel, size, lights, lod=lod)
+            error = np.abs(np.array(value[:3]) - expected).max() / np.abs(expected).max()
+            assert error <= tolerance("view.methods.max_rel"), f"{key}: {error}"
+        assert opened.complaints() == []
 
 
 # --- what people do -----------------------------------------------------------------------------------------------
