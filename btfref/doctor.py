@@ -58,6 +58,13 @@ print(json.dumps({
     "float_target": pixel == (0.5, 1.5, -2.0, 1.0)}))
 """
 
+_WEBGL_PROBE = """
+import json
+from btfref.rendering.web import chromium, probe
+with chromium.Browser(timeout=40) as browser:
+    print(json.dumps(probe.Device(browser).facts))
+"""
+
 
 @dataclass(frozen=True)
 class Check:
@@ -90,7 +97,7 @@ class Examination:
     ----------
     checks : tuple of Check
     facts : dict
-        The same for programs: ``versions``, ``llvm``, ``variants``, ``gl``, ``gpu``, ``machine``.
+        The same for programs: ``versions``, ``llvm``, ``variants``, ``gl``, ``webgl``, ``gpu``, ``machine``.
     """
 
     checks: tuple[Check, ...]
@@ -201,14 +208,17 @@ def examine() -> Examination:
             if not (name.startswith("llvm") and llvm.path is None)
         }
         drawing = pool.submit(probe, _GL_PROBE, environment={"GALLIVM_PERF": "no_aos_sampling"})
+        browser = system.chromium()
+        page = pool.submit(probe, _WEBGL_PROBE) if browser else None
         cards = pool.submit(_gpu)
         variants = {name: result.result() for name, result in waiting.items()}
         gl, gpu = drawing.result(), cards.result()
+        webgl = page.result() if page else {"works": False, "error": "no Chromium"}
     for name in VARIANTS:
         variants.setdefault(name, {"works": False, "error": "no usable LLVM library"})
     programs = {
         "glslangValidator": shutil.which("glslangValidator"),
-        "chromium": system.chromium(),
+        "chromium": browser,
     }
     facts = {
         "machine": machine(),
@@ -221,6 +231,7 @@ def examine() -> Examination:
         },
         "variants": variants,
         "gl": gl,
+        "webgl": webgl,
         "gpu": gpu,
         "programs": programs,
         "broken_packages": [asdict(point) for point in broken_points()],
@@ -242,6 +253,7 @@ def _checks(facts: Facts) -> Iterator[Check]:
     yield from _variant_checks(facts["variants"], facts["gpu"])
     yield from _gl_checks(facts["gl"])
     yield from _program_checks(facts["programs"])
+    yield from _webgl_checks(facts["webgl"], facts["programs"]["chromium"])
 
 
 def _version_checks(installed: Mapping[str, str | None]) -> Iterator[Check]:
@@ -327,5 +339,17 @@ def _program_checks(programs: Mapping[str, str | None]) -> Iterator[Check]:
     for requirement in system.REQUIREMENTS:
         if requirement.for_tests:
             path = programs["chromium" if requirement.name == "Chromium" else requirement.name]
-            mend = "" if path else f"for the tests only: {system.mend_command([requirement])}"
+            use = "the tests and WebGL 2" if requirement is system.CHROMIUM else "the tests only"
+            mend = "" if path else f"for {use}: {system.mend_command([requirement])}"
             yield Check("programs", requirement.name, "ok" if path else "absent", path or "not found", mend)
+
+
+def _webgl_checks(webgl: Facts, program: str | None) -> Iterator[Check]:
+    """Nothing needs a browser but the third renderer of validation, stress and tests."""
+    if webgl["works"]:
+        yield Check("programs", "WebGL 2", "ok", f"{webgl['webgl_renderer']} in {webgl['browser']}")
+    elif program:
+        mend = "another Chromium; without it shaders are not run in a browser"
+        yield Check("programs", "WebGL 2", "warning", webgl["error"], mend)
+    else:
+        yield Check("programs", "WebGL 2", "absent", "no Chromium")

@@ -154,6 +154,12 @@ def bare_mesh(folder, patch):
     (folder / "bare.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
 
 
+def few_samplers(folder, patch):
+    patch.setattr("btfref.rendering.ports.package.MOST_SAMPLERS", 1)
+
+
+PORT = "export good.exr --format gl -o"
+
 RENDER, REALTIME = "render good.xml -o out.exr --grid 1", "realtime good.xml -o out.exr"
 
 ROWS = [
@@ -351,6 +357,21 @@ ROWS = [
         "packages", "of another type", "fit odd good.btf.zarr -o out.exr", ("odd",), prepare=points(odd=dict)
     ),
     Row("packages", "no such exporter", "export good.btf.zarr --format gone -o new", ("ubo", "utia", "bonn")),
+    Row("ports", "a sampled BTF", f"{PORT.replace('.exr', '.btf.zarr')} new", ("good.btf.zarr",)),
+    Row("ports", "a picture", f"{PORT.replace('good', 'image')} new", ("image.exr", "representation")),
+    Row("ports", "no such file", f"{PORT.replace('good', 'none')} new", ("none.exr",)),
+    Row("ports", "a folder there", f"{PORT} good.btf.zarr", ("exists already",)),
+    Row("ports", "no folder for it", f"{PORT} none/new", ("no such folder", "none")),
+    Row("ports", "settings", f"{PORT} new --quality 3", ("gl takes no settings", "quality")),
+    Row(
+        "ports", "NaN", f"{PORT} new", ("values", "good.exr"),
+        prepare=with_array("values", lambda a: a * np.float32(np.nan)),
+    ),
+    Row("ports", "too many textures", f"{PORT} new", ("textures", "at most 1"), prepare=few_samplers),
+    Row(
+        "ports", "disk full", f"{PORT} new", ("No space left",),
+        prepare=failing("btfref.rendering.ports.folder.ktx2", OSError(errno.ENOSPC, "No space left on device")),
+    ),
     # 9
     Row("view", "a picture", "view image.exr -o page.html", ("image.exr", "representation")),
     Row("view", "no such file", "view gone.exr -o page.html", ("gone.exr",)),
@@ -359,15 +380,12 @@ ROWS = [
     Row("view", "a folder there", "view good.exr -o folder.html", ("folder",), prepare=folder_there),
     Row("view", "no such mesh", "view good.exr --mesh gone.obj -o page.html", ("gone.obj",)),
     Row(
-        "view",
-        "a mesh without texture coordinates",
-        "view good.exr --mesh bare.obj -o page.html",
-        ("bare.obj", "texture coordinates"),
-        prepare=bare_mesh,
+        "view", "a mesh without texture coordinates", "view good.exr --mesh bare.obj -o page.html",
+        ("bare.obj", "texture coordinates"), prepare=bare_mesh,
     ),
     Row("view", "no such port", "view good.exr --port 99999", ("65535",)),
     Row("view", "more files than a page has", f"view {'good.exr ' * 9}-o page.html", ("at most 8",)),
-]
+]  # fmt: skip
 
 
 def _full_once(folder, patch):

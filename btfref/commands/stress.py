@@ -1,8 +1,8 @@
 """Stress the numerical stability of all methods: hard lookups, hard data, symmetries of fits.
 
-Values of the ports (Dr.Jit with and without FastMath, GLSL) are judged against the float64 definition, by relative
-error and in units in the last place; fits by determinism, symmetry and monotone error. Every failure is one line with
-a command that shows it alone. Exit status 1 when anything failed.
+Values of the ports (Dr.Jit with and without FastMath, GLSL, and WebGL 2 where there is a Chromium) are judged against
+the float64 definition, by relative error and in units in the last place; fits by determinism, symmetry and monotone
+error. Every failure is one line with a command that shows it alone. Exit status 1 when anything failed.
 
   btfref stress --only lpca
   btfref stress --long -o stress.md
@@ -81,4 +81,6 @@ def run(args: Namespace) -> int:
             f"{result['cases']} cases, {result['failures']} failures, {result['explained']} explained by the "
             "rounding of their arguments"
         )
+        for name in result["parameters"]["absent"]:
+            emit(f"not run: {name}; this machine lacks what it needs (btfref doctor)")
     return int(result["failures"] > 0)

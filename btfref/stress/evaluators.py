@@ -7,9 +7,9 @@ chooses by what the rows say.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from types import ModuleType
 from typing import TYPE_CHECKING, Protocol
@@ -21,8 +21,10 @@ from btfref import conventions
 from btfref.errors import InputError
 from btfref.numerics.device_arrays import to_device
 from btfref.precision import computing_in
+from btfref.system import chromium
 
 if TYPE_CHECKING:
+    from btfref.rendering.web.probe import WebProbe
     from btfref.representations.protocol import Representation
     from btfref.types import JitArray, PathLike
 
@@ -248,6 +250,29 @@ class Glsl(Evaluator):
         return probe_malformed(self.representation, uv, w_light, w_view)
 
 
+class WebGl(Evaluator):
+    """The port package in Chromium's WebGL 2, one pixel a lookup."""
+
+    def prepare(
+        self, uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray, *, lod: ArrayLike | None = None
+    ) -> WebProbe:
+        """Textures and a program in the browser; each run draws them."""
+        from btfref.rendering.gl.probe import broadcast_points
+        from btfref.rendering.ports.package import port_package
+        from btfref.rendering.web.probe import WebProbe
+
+        rows, _ = broadcast_points(uv, w_light, w_view, 0.0 if lod is None else lod)
+        return WebProbe(port_package(self.representation, filter_type=self.filter_type), rows)
+
+    def malformed(self, uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray) -> dict[str, int]:
+        """As the shader counts them."""
+        if not len(uv):
+            return {"directions": 0, "coordinates": 0}
+        with self.prepare(uv, w_light, w_view) as evaluation:
+            evaluation.run()
+            return evaluation.malformed()
+
+
 @dataclass(frozen=True)
 class Row:
     """One evaluator of the table.
@@ -263,7 +288,9 @@ class Row:
     compiles : bool
         Whether every material is compiled first, which takes seconds.
     needs : str or None
-        What it needs beyond the package: "llvm", "gl".
+        What it needs beyond the package: "llvm", "gl", "chromium".
+    there : callable
+        Whether this machine has it; runs that choose no evaluators do without those that are not there, and say so.
     """
 
     title: str
@@ -271,6 +298,7 @@ class Row:
     port: bool = False
     compiles: bool = False
     needs: str | None = None
+    there: Callable[[], bool] = field(default=lambda: True)
 
 
 #: What all others are measured against.
@@ -285,7 +313,15 @@ EVALUATORS = {
         "Dr.Jit without fast math", partial(DrJit, fast=False), compiles=True, needs="llvm"
     ),
     "glsl": Row("GLSL", Glsl, port=True, needs="gl"),
+    # Nothing else asks a user for a browser.
+    "webgl": Row("WebGL 2", WebGl, port=True, needs="chromium", there=lambda: chromium() is not None),
 }
+
+
+def present(names: Iterable[str]) -> tuple[str, ...]:
+    """Those evaluators that this machine can run."""
+    return tuple(name for name in names if EVALUATORS[name].there())
+
 
 #: Those that are measured against the definition.
 MEASURED = tuple(name for name in EVALUATORS if name != DEFINITION)
@@ -318,7 +354,7 @@ def evaluator(
     InputError
         Unknown name.
     MissingDependencyError
-        Without LLVM or OpenGL, here or when it is first used.
+        Without LLVM, OpenGL or Chromium, here or when it is first used.
     """
     if name not in EVALUATORS:
         raise InputError(

@@ -8,6 +8,7 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance, tolerance_of
+from btfref.outputs import refuse_existing, require_folder_of
 from btfref.rendering.gl.probe import broadcast_points
 from btfref.rendering.ports.answers import KnownAnswers
 from btfref.rendering.ports.folder import write_folder
@@ -91,7 +92,7 @@ def export_port(
     path: PathLike,
     out: PathLike,
     *,
-    n: int = N_PROBES,
+    n: int | None = None,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Facts:
@@ -103,8 +104,8 @@ def export_port(
         Representation.
     out : path-like
         Folder to make.
-    n : int
-        Known answers.
+    n : int, optional
+        Known answers; default :data:`N_PROBES`.
     seed : int
         Of their lookups.
     progress : callable, optional
@@ -119,11 +120,11 @@ def export_port(
     InputError
         No representation, one that a port cannot hold, or an existing path.
     """
-    from btfref.outputs import refuse_existing, require_folder_of
     from btfref.representations.file.container import load
 
     refuse_existing(out)
     require_folder_of(out)
     representation = load(path)
     package = port_package(representation)
-    return write_folder(package, known_answers(representation, n, seed=seed, progress=progress), out)
+    answers = known_answers(representation, N_PROBES if n is None else n, seed=seed, progress=progress)
+    return write_folder(package, answers, out)

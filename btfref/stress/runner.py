@@ -17,7 +17,7 @@ from btfref.gates.tolerances import tolerance
 from btfref.registry import method, usable_methods
 from btfref.stress import properties
 from btfref.stress.data import DATA, make, scattered
-from btfref.stress.evaluators import DEFINITION, EVALUATORS, MEASURED, Evaluator, evaluator
+from btfref.stress.evaluators import DEFINITION, EVALUATORS, MEASURED, Evaluator, evaluator, present
 from btfref.stress.judging import Finding, judge_values, limit_finding, valid_lookups
 from btfref.stress.lookups import BLOCK, Lookups, block
 
@@ -53,7 +53,7 @@ def run(
     data : iterable of str, optional
         Names in :data:`btfref.stress.data.DATA`; default all, and the checks of fits.
     evaluators : iterable of str, optional
-        Ports; default all.
+        Ports; default all that this machine can run.
     long : bool
         More lookups, and all ports on all data and storages: above 10⁶ lookups.
     seed : int
@@ -75,7 +75,7 @@ def run(
     for name in names:
         if name not in DATA:
             raise InputError("unknown data", field="--data", got=repr(name), expected=", ".join(DATA))
-    ports = MEASURED if evaluators is None else tuple(evaluators)
+    ports = present(MEASURED) if evaluators is None else tuple(evaluators)
     for name in ports:
         if name not in MEASURED:
             raise InputError(
@@ -103,7 +103,14 @@ def run(
         "cases": sum(f.cases for f in findings),
         "failures": sum(f.failures for f in findings),
         "explained": sum(f.explained for f in findings),
-        "parameters": {"methods": keys, "data": names, "evaluators": list(ports), "seed": seed, "long": long},
+        "parameters": {
+            "methods": keys,
+            "data": names,
+            "evaluators": list(ports),
+            "absent": [] if evaluators is not None else [name for name in MEASURED if name not in ports],
+            "seed": seed,
+            "long": long,
+        },
     }
 
 

@@ -6,7 +6,9 @@ Nothing here knows a method: a representation comes as its port arrays and its G
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -36,9 +38,22 @@ _DTYPES = {"float16": "f2", "float32": "f4", "uint32": "u4", "uint8": "f1"}
 EGL: dict[str, Any] = {"backend": "egl"}
 
 
-@cache
+#: What draws in place of the process's own context.
+_OTHER: ContextVar[JitArray] = ContextVar("other context", default=None)
+
+
+@contextmanager
+def drawing_with(other: JitArray) -> Iterator[None]:
+    """Let another context draw inside a ``with``: one with the methods of moderngl's that are used here."""
+    token = _OTHER.set(other)
+    try:
+        yield
+    finally:
+        _OTHER.reset(token)
+
+
 def context() -> JitArray:
-    """The process's OpenGL context (EGL, no window).
+    """What draws: the process's OpenGL context (EGL, no window), or that of :func:`drawing_with`.
 
     Returns
     -------
@@ -49,6 +64,12 @@ def context() -> JitArray:
     MissingDependencyError
         When no OpenGL 3.3 driver can be reached.
     """
+    other = _OTHER.get()
+    return _own_context() if other is None else other
+
+
+@cache
+def _own_context() -> JitArray:
     # Mesa's llvmpipe otherwise filters 8-bit textures on a path whose rounding differs between processors.
     os.environ.setdefault("GALLIVM_PERF", "no_aos_sampling")
     import moderngl
@@ -308,6 +329,7 @@ def compile_program(
     BtfrefError
         With the compiler's message in terms of files and lines.
     """
+    composition = {"target": getattr(ctx, "glsl", "330 core"), **composition}
     stages = {"vertex_shader": composer.compose(vertex, **composition)}
     if fragment:
         stages["fragment_shader"] = composer.compose(fragment, **composition)

@@ -274,6 +274,8 @@ def port_package(
     arrays, defines = device.shader_tables(rep, filter_type=filter_type, light=light)
     rows, columns = rep.meta["texels"]
     defines |= {"LEVEL_0_ROWS": int(rows), "LEVEL_0_COLUMNS": int(columns)}
+    # The same text whatever order a file has its maps in.
+    defines = dict(sorted(defines.items()))
     shader, directories = device.shader_file(rep)
     source = composer.compose(
         "hosts/library.glsl",

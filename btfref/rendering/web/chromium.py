@@ -73,7 +73,9 @@ class Browser:
             raise MissingDependencyError(
                 "Chromium is not on this machine", f"run: {mend_command([CHROMIUM])}"
             )
-        self.timeout, self.events, self._last, self._rest = timeout, [], 0, b""
+        self.timeout, self._last, self._rest = timeout, 0, b""
+        self.events: list[Facts] = []
+        self._crashed: set[str | None] = set()
         self._profile = tempfile.mkdtemp(prefix="btfref-chromium-")
         ours, theirs = _pipe(), _pipe()
         try:
@@ -131,6 +133,8 @@ class Browser:
         """
         if self._write < 0:
             raise BtfrefError(f"the browser is closed; {method}")
+        if session in self._crashed:
+            raise BtfrefError(f"the browser's page crashed; {method}")
         self._last += 1
         message: Facts = {"id": self._last, "method": method, "params": parameters or {}}
         if session is not None:
@@ -145,7 +149,10 @@ class Browser:
                 return answer["result"]
             if "method" in answer:
                 self.events.append(answer)
-                if answer["method"] == "Inspector.targetCrashed" and answer.get("sessionId") == session:
+                if answer["method"] == "Inspector.targetCrashed":
+                    self._crashed.add(answer["sessionId"])
+                # A crashed page never answers.
+                if session in self._crashed:
                     raise BtfrefError(f"the browser's page crashed; {method}")
 
     def _put(self, data: bytes, method: str, deadline: float) -> None:

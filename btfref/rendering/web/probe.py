@@ -23,7 +23,7 @@ RENDERER = "SwiftShader"
 
 
 class Device:
-    """A WebGL 2 context of a page.
+    """A WebGL 2 context of a page of its own; a context manager.
 
     Parameters
     ----------
@@ -49,6 +49,12 @@ class Device:
         except BaseException:
             self.page.close()
             raise
+
+    def __enter__(self) -> Device:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.page.close()
 
     @property
     def facts(self) -> dict[str, str]:
@@ -109,6 +115,7 @@ class WebProbe:
         except BtfrefError:
             if self._own:
                 _kept().clear()
+                self._device.page.close()
             raise
 
     def run(self) -> None:

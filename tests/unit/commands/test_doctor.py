@@ -123,10 +123,30 @@ def test_opengl_is_described_here(examination, need):
     assert gl["version"]
 
 
+def test_webgl_is_described_here(examination, need):
+    need("chromium")
+    webgl = examination.facts["webgl"]
+    assert webgl["works"]
+    assert "SwiftShader" in webgl["webgl_renderer"]
+
+
+@pytest.mark.parametrize(("program", "status"), [("/usr/bin/chromium", "warning"), (None, "absent")])
+def test_webgl_is_optional(examination, program, status):
+    broken = faulty(
+        examination,
+        webgl={"works": False, "error": "no WebGL 2 in this browser"},
+        programs={"glslangValidator": None, "chromium": program},
+    )
+    (check,) = [check for check in broken.checks if check.name == "WebGL 2"]
+    assert check.status == status
+    assert bool(check.mend) == (status == "warning")
+
+
 def test_probes_run_side_by_side(need, monkeypatch):
     """Each waits for all others: one after the other they would never meet."""
     need("llvm")
-    calls, all_here = [], threading.Barrier(len(doctor.VARIANTS) + 1)
+    count = len(doctor.VARIANTS) + 1 + (system.chromium() is not None)
+    calls, all_here = [], threading.Barrier(count)
 
     def probe(*arguments, **_):
         calls.append(arguments)
@@ -135,7 +155,7 @@ def test_probes_run_side_by_side(need, monkeypatch):
 
     monkeypatch.setattr(doctor, "probe", probe)
     assert not doctor.examine().facts["gl"]["works"]
-    assert len(calls) == len(doctor.VARIANTS) + 1
+    assert len(calls) == count
 
 
 def test_json_and_exit_status(need, capsys):
@@ -144,7 +164,9 @@ def test_json_and_exit_status(need, capsys):
     status = main(["doctor", "--json"])
     facts = json.loads(capsys.readouterr().out)
     assert status == (0 if facts["ok"] else 1)
-    assert {"checks", "versions", "llvm", "variants", "gl", "gpu", "machine", "programs"} <= set(facts)
+    assert {"checks", "versions", "llvm", "variants", "gl", "webgl", "gpu", "machine", "programs"} <= set(
+        facts
+    )
     assert facts["versions"]["mitsuba"] == doctor.PINNED["mitsuba"]
 
 
