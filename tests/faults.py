@@ -146,6 +146,14 @@ def read_only(folder, patch):
     patch.setattr("btfref.commands.shared.reading.os.access", lambda *_: False)
 
 
+def folder_there(folder, patch):
+    (folder / "folder.html").mkdir()
+
+
+def bare_mesh(folder, patch):
+    (folder / "bare.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+
+
 def few_samplers(folder, patch):
     patch.setattr("btfref.rendering.ports.package.MOST_SAMPLERS", 1)
 
@@ -364,6 +372,19 @@ ROWS = [
         "ports", "disk full", f"{PORT} new", ("No space left",),
         prepare=failing("btfref.rendering.ports.folder.ktx2", OSError(errno.ENOSPC, "No space left on device")),
     ),
+    # 9
+    Row("view", "a picture", "view image.exr -o page.html", ("image.exr", "representation")),
+    Row("view", "no such file", "view gone.exr -o page.html", ("gone.exr",)),
+    Row("view", "no page", "view good.exr -o page.txt", (".html",)),
+    Row("view", "its input", "view good.exr -o good.exr", ("input",)),
+    Row("view", "a folder there", "view good.exr -o folder.html", ("folder",), prepare=folder_there),
+    Row("view", "no such mesh", "view good.exr --mesh gone.obj -o page.html", ("gone.obj",)),
+    Row(
+        "view", "a mesh without texture coordinates", "view good.exr --mesh bare.obj -o page.html",
+        ("bare.obj", "texture coordinates"), prepare=bare_mesh,
+    ),
+    Row("view", "no such port", "view good.exr --port 99999", ("65535",)),
+    Row("view", "more files than a page has", f"view {'good.exr ' * 9}-o page.html", ("at most 8",)),
 ]  # fmt: skip
 
 

@@ -13,6 +13,7 @@ COMMANDS = (
     "export",
     "fit",
     "info",
+    "view",
     "render",
     "realtime",
     "compare",

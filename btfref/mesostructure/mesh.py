@@ -68,12 +68,9 @@ def mesh(
     if up not in (None, "y", "z"):
         raise InputError("axis that points up", field="up", got=repr(up), expected="y or z")
     notes = Notes()
-    pieces = _read(path, notes)
-    if (up or ("y" if path.suffix.lower() in _Y_UP else "z")) == "y":
-        turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float64)
-        pieces = [piece.moved(turn, np.zeros(3)) for piece in pieces]
+    pieces = read_mesh(path, notes, up=up)
     corner, side = _square(tile, pieces, path)
-    pieces = [_with_area(piece.moved(np.eye(3) / side, -corner / side)) for piece in pieces]
+    pieces = [with_area(piece.moved(np.eye(3) / side, -corner / side)) for piece in pieces]
     pieces = [piece for piece in pieces if len(piece.faces)]
     if not pieces:
         raise InputError("no triangle with an area", file=path, field="file")
@@ -101,7 +98,34 @@ def mesh(
     return Mesostructure("mesh", parameters, tuple(parts), notes.lines())
 
 
-def _with_area(piece: Piece) -> Piece:
+def read_mesh(path: Path, notes: Notes, *, up: str | None = None) -> list[Piece]:
+    """Pieces of a mesh file as it places them, z up.
+
+    Parameters
+    ----------
+    path : Path
+    notes : Notes
+        Takes what is ignored.
+    up : {"z", "y"}, optional
+        Which axis of the file points up; by default y for glTF, z otherwise.
+
+    Returns
+    -------
+    list of Piece
+
+    Raises
+    ------
+    InputError
+        For a file that cannot be read, or without triangles.
+    """
+    pieces = _read(path, notes)
+    if (up or ("y" if path.suffix.lower() in _Y_UP else "z")) == "y":
+        turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float64)
+        pieces = [piece.moved(turn, np.zeros(3)) for piece in pieces]
+    return pieces
+
+
+def with_area(piece: Piece) -> Piece:
     """The piece without triangles that have no area: nothing sees them, and they have no side."""
     corners = piece.vertices[piece.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -14,7 +14,7 @@ FLOORS = """
 btfref.__main__ btfref.docs
 btfref.cli
 btfref.commands btfref.pytest_plugin
-btfref.bench btfref.demo btfref.testing
+btfref.bench btfref.demo btfref.testing btfref.view
 btfref.report
 btfref.validate
 btfref.stress
