@@ -43,9 +43,7 @@ def cluster(need):
 
 
 @pytest.mark.filterwarnings("default")
-@pytest.mark.parametrize(
-    "extra", [{}, {"estimator": "path"}, {"estimator": "path", "target_error": 0.1}]
-)
+@pytest.mark.parametrize("extra", [{}, {"estimator": "path"}, {"estimator": "path", "target_error": 0.1}])
 def test_workers_write_the_same_bytes(tmp_path, cluster, extra):
     alone, shared = tmp_path / "alone.btf.zarr", tmp_path / "shared.btf.zarr"
     synthesize_store(alone, "checker", **SETTINGS, **extra)

@@ -176,6 +176,40 @@ class Shards:
         where = index.reshape(-1).view(np.uint8)
         write_bytes(path, data, where, checksum(where))
 
+    def read(self, view: int, values: np.ndarray) -> None:
+        """Read a whole view into an array (lights, rows, columns, 3).
+
+        Raises
+        ------
+        ValueError
+            A file that is missing, incomplete or damaged.
+        """
+        sides = [k * t for k, t in zip(self.grid, (1, *self.tile), strict=True)]
+        for shard in np.ndindex(*(-(-n // side) for n, side in zip(values.shape, sides, strict=False))):
+            first = [k * side for k, side in zip(shard, sides, strict=True)]
+            part = values[tuple(slice(a, a + side) for a, side in zip(first, sides, strict=True))]
+            path = self.path(view, (shard[0], shard[1], shard[2]))
+            try:
+                data = np.fromfile(path, np.uint8)
+            except FileNotFoundError:
+                raise ValueError(f"no file {path.relative_to(self.folder)}") from None
+            index = self.index(data, path).reshape(*self.grid, 2)
+            for light, row, column in np.ndindex(len(part), *(-(-n // t) for n, t in zip(
+                    part.shape[1:3], self.tile, strict=True))):  # fmt: skip
+                start, size = index[light, row, column].tolist()
+                if start == _ABSENT:
+                    raise ValueError(f"a chunk of {path.relative_to(self.folder)} is missing")
+                chunk = data[start : start + size - _SUM]
+                if checksum(chunk) != data[start + size - _SUM : start + size].tobytes():
+                    raise ValueError(f"checksum of a chunk of {path.relative_to(self.folder)}")
+                place = part[
+                    light,
+                    row * self.tile[0] : (row + 1) * self.tile[0],
+                    column * self.tile[1] : (column + 1) * self.tile[1],
+                ]
+                tile = chunk.view(self.dtype).reshape(*self.tile, 3)
+                place[...] = tile[: place.shape[0], : place.shape[1]]
+
     def _chunks(self, path: Path) -> dict[int, np.ndarray]:
         """Chunks of a file, with their checksums, by their numbers."""
         try:

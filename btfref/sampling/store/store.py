@@ -140,6 +140,7 @@ class BTFStore:
         import zarr
 
         self.path = Path(path)
+        self._local = store is None
         self.attributes = attributes_of(self.path)
         self._group = self._guard("zarr.json", lambda: zarr.open_group(store or str(self.path), mode="r+"))
         self._values = self._array("values", 5)
@@ -437,8 +438,16 @@ class BTFStore:
         return values, None if wanted is None else self._read("variance", wanted, selection)
 
     def _read(self, field: str, array: StoredArray, selection: Sequence[slice | np.ndarray]) -> np.ndarray:
+        texels = zip(selection[1:], array.shape[1:], strict=False)
+        whole = all(isinstance(part, slice) and part.indices(n) == (0, n, 1) for part, n in texels)
         selection = (*selection, slice(None))
-        if all(isinstance(part, slice) for part in selection):
+        if self._local and whole:
+            # Whole files at once: Zarr spends a call or more on each chunk.
+            views = np.arange(len(self.views))[selection[0]]
+            values = np.zeros((len(views), *array.shape[1:]), self._shards[field].dtype)
+            for place, view in zip(values, views.tolist(), strict=True):
+                self._guard(field, partial(self._shards[field].read, view, place))
+        elif all(isinstance(part, slice) for part in selection):
             values = self._guard(field, lambda: array[selection])
         else:
             values = self._guard(field, lambda: array.oindex[selection])

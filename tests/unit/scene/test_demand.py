@@ -173,7 +173,15 @@ def test_pictures_are_equal_bit_by_bit(need, fits, one_light):
 
 @pytest.fixture(scope="module")
 def settings():
-    return {"texels": 8, "views": "ubo81", "lights": "ubo81", "spp": 2, "seed": 3, "max_depth": 3, "estimator": "path"}
+    return {
+        "texels": 8,
+        "views": "ubo81",
+        "lights": "ubo81",
+        "spp": 2,
+        "seed": 3,
+        "max_depth": 3,
+        "estimator": "path",
+    }
 
 
 @pytest.fixture(scope="module")
