@@ -33,6 +33,7 @@ import numpy as np
 
 from btfref.numerics.device_arrays import in_one_kernel, to_device
 from btfref.sampling.surface.cache import LARGEST, LEAST, VisibilityCache
+from btfref.sampling.surface.frames import SharedFrames
 from btfref.sampling.surface.gather import gather
 from btfref.sampling.surface.lobes import BroadLobes
 from btfref.sampling.surface.pilot import contrast
@@ -58,7 +59,7 @@ PILOT_RAYS = 3_000_000
 BACK_DIRECTIONS = 8
 
 #: Memory (bytes) of the results of views that are gathered together.
-GATHER_BUFFER = 96 << 20
+GATHER_BUFFER = 64 << 20
 
 # Streams of random numbers.
 _POINTS, _RAYS, _BROAD, _REST, _PLACES = range(5)
@@ -254,6 +255,7 @@ class SurfaceEstimator:
             if k in wanted:
                 used[record if self.mask is None else record[self.mask[texel]]] = True
         self.used = used
+        self.frames = SharedFrames(self.surface, n_points, scene.lobes)
         self._light_table(seen[scene.lights.rows.numpy()], sights)
 
     def _view_rays(self, rays: list[np.ndarray]) -> tuple[Surface, np.ndarray, JitArray]:
@@ -378,6 +380,7 @@ class SurfaceEstimator:
         each = self.n_texels * max(len(self.lit), 1) * 12
         together = max(1, min(GATHER_BUFFER // each, (2**31 - 1) * 2 // each))
         live = [view for view in views if view in self.row and len(self.lit)]
+        together = -(-len(live) // max(1, -(-len(live) // together)))  # none is left alone at the end
         held: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
         done = 0
         for view in views:
@@ -400,7 +403,7 @@ class SurfaceEstimator:
         rows = [self.row[view] for view in views]
         walks = self.walks if self.walks is not None and self.walks.hits else None
         return gather(
-            self.scene, self.surface, self.table, rows, [self.bins[k] for k in rows],
+            self.scene, self.surface, self.frames, self.table, rows, [self.bins[k] for k in rows],
             radiance=None if walks is None else walks.radiance(rows),
             splats=None if walks is None else walks.splatted(rows, self.texels, self.variance),
             texels=self.texels, variance=self.variance,

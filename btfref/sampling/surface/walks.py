@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from btfref.sampling.surface.points import Points
     from btfref.sampling.tiled_scene import TiledScene
 
-#: Lights that one lane serves where vertices are connected to them.
-LIGHTS_PER_LANE = 3
+#: Lights that one lane serves, and multiple of the number of lanes of a vertex or a texel: whole SIMD packets then
+#: share what is looked up for all lights, and what one of their lanes need not evaluate none does.
+LIGHTS_PER_LANE, PACKET = 6, 8
 
 _FIELDS = ("p", "n", "s", "shading", "uv", "number", "albedo")
 
@@ -231,6 +232,13 @@ class Lights:
 
         return dr.width(self.rows)
 
+    def division(self) -> tuple[int, int]:
+        """Lanes that share the lights, and lights of each, as many lanes apart: neighbours read neighbours."""
+        lanes = -(-self.count // LIGHTS_PER_LANE)
+        if lanes > PACKET // 2:
+            lanes = -(-lanes // PACKET) * PACKET
+        return lanes, -(-self.count // lanes)
+
 
 def connect(lights: Lights, target: JitArray, offset: JitArray, bring: Bring, *, stride: int) -> None:
     """Add what vertices get from all lights to ``target``, in the order of the vertices.
@@ -256,11 +264,11 @@ def connect(lights: Lights, target: JitArray, offset: JitArray, bring: Bring, *,
     first = np.flatnonzero(np.concatenate([[True], places[1:] != places[:-1]]))
     start = to_device(mi.UInt32, np.append(first, len(places)))
     order, places = to_device(mi.UInt32, order), to_device(mi.UInt32, places[first])
-    n_blocks, count = -(-lights.count // LIGHTS_PER_LANE), dr.opaque(mi.UInt32, lights.count)
+    (n_blocks, n_slots), count = lights.division(), dr.opaque(mi.UInt32, lights.count)
     lane = dr.arange(mi.UInt32, len(first) * n_blocks)
     blocks = dr.opaque(mi.UInt32, n_blocks)
-    place, light = lane // blocks, (lane % blocks) * LIGHTS_PER_LANE
-    chosen = [dr.minimum(light + j, count - 1) for j in range(LIGHTS_PER_LANE)]
+    place, light = lane // blocks, [lane % blocks + j * blocks for j in range(n_slots)]
+    chosen = [dr.minimum(k, count - 1) for k in light]
     vectors = [dr.gather(mi.Vector3f, lights.vectors, k) for k in chosen]
     rows = [dr.gather(mi.UInt32, lights.rows, k) for k in chosen]
     begin, end = dr.gather(mi.UInt32, start, place), dr.gather(mi.UInt32, start, place + 1)
@@ -276,12 +284,12 @@ def connect(lights: Lights, target: JitArray, offset: JitArray, bring: Bring, *,
 
     def write() -> None:
         for j, value in enumerate(sums):
-            inside = light + j < count
+            inside = light[j] < count
             for channel in range(3):
                 dr.scatter_add(
                     target,
                     value[channel],
-                    dr.fma(light + j, stride, at) + channel,
+                    dr.fma(light[j], stride, at) + channel,
                     inside,
                     mode=dr.ReduceMode.NoConflicts,
                 )
