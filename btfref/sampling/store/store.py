@@ -215,7 +215,9 @@ class BTFStore:
     @property
     def coverage(self) -> np.ndarray:
         """Which parts are there: bool, shape (views, lights, tile rows, tile columns)."""
-        return self._guard("coverage", lambda: self._coverage[:]) == 1
+        if not self._local:
+            return self._guard("coverage", lambda: self._coverage[:]) == 1
+        return np.stack([self.covered(view) for view in range(len(self.views))])
 
     @property
     def complete(self) -> bool:
@@ -241,7 +243,8 @@ class BTFStore:
 
     def covered(self, view: int) -> np.ndarray:
         """Which parts of a view are there: bool, shape (lights, tile rows, tile columns)."""
-        return self._guard("coverage", lambda: self._coverage[int(view)]) == 1
+        marks = self._guard("coverage", partial(self._marks, int(view)))
+        return np.zeros(self._coverage.shape[1:], bool) if marks is None else marks[0] == 1
 
     def write_map(self, name: str, view: int, values: np.ndarray) -> None:
         """Write a view of an array that `maps` gives."""
@@ -379,14 +382,18 @@ class BTFStore:
     def _mark(self, view: int, lights: np.ndarray, places: np.ndarray) -> None:
         """Note what is there of a view; a view that is written whole is marked without a look at its marks."""
         shape = (1, *self._coverage.shape[1:])
-        path = self.path.joinpath("coverage", "c", str(view), "0", "0", "0")
-        marks = None
-        if len(lights) * len(places) < np.prod(shape):
-            marks = read_chunk(path, np.dtype(np.uint8), shape)
-        marks = np.zeros(shape, np.uint8) if marks is None else marks.copy()
+        there = self._marks(view) if len(lights) * len(places) < np.prod(shape) else None
+        marks = np.zeros(shape, np.uint8) if there is None else there.copy()
         for row, column in places:
             marks[0, lights, row, column] = 1
-        write_chunk(path, marks)
+        write_chunk(self._marks_file(view), marks)
+
+    def _marks_file(self, view: int) -> Path:
+        return self.path.joinpath("coverage", "c", str(view), "0", "0", "0")
+
+    def _marks(self, view: int) -> np.ndarray | None:
+        """What the file of a view's coverage holds; None where nothing was written."""
+        return read_chunk(self._marks_file(view), np.dtype(np.uint8), (1, *self._coverage.shape[1:]))
 
     def read(
         self,

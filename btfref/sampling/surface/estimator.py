@@ -33,7 +33,6 @@ import numpy as np
 
 from btfref.numerics.device_arrays import in_one_kernel, to_device
 from btfref.sampling.surface.cache import LARGEST, LEAST, VisibilityCache
-from btfref.sampling.surface.frames import SharedFrames
 from btfref.sampling.surface.gather import gather
 from btfref.sampling.surface.lobes import BroadLobes
 from btfref.sampling.surface.pilot import contrast
@@ -255,7 +254,6 @@ class SurfaceEstimator:
             if k in wanted:
                 used[record if self.mask is None else record[self.mask[texel]]] = True
         self.used = used
-        self.frames = SharedFrames(self.surface, n_points, scene.lobes)
         self._light_table(seen[scene.lights.rows.numpy()], sights)
 
     def _view_rays(self, rays: list[np.ndarray]) -> tuple[Surface, np.ndarray, JitArray]:
@@ -403,7 +401,7 @@ class SurfaceEstimator:
         rows = [self.row[view] for view in views]
         walks = self.walks if self.walks is not None and self.walks.hits else None
         return gather(
-            self.scene, self.surface, self.frames, self.table, rows, [self.bins[k] for k in rows],
+            self.scene, self.surface, self.table, rows, [self.bins[k] for k in rows],
             radiance=None if walks is None else walks.radiance(rows),
             splats=None if walks is None else walks.splatted(rows, self.texels, self.variance),
             texels=self.texels, variance=self.variance,

@@ -14,12 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from btfref.numerics.device_arrays import in_one_kernel, packed, to_device, unpacked
-from btfref.sampling.surface.frames import SHARED
 from btfref.sampling.surface.points import starts
 
 if TYPE_CHECKING:
     from btfref.sampling.surface.estimator import SurfaceScene
-    from btfref.sampling.surface.frames import SharedFrames
     from btfref.sampling.surface.points import Bins
     from btfref.sampling.surface.walks import Surface
     from btfref.types import JitArray
@@ -31,7 +29,6 @@ LEAST_FREEDOM = 4
 def gather(
     scene: SurfaceScene,
     surface: Surface,
-    frames: SharedFrames,
     table: JitArray,
     rows: Sequence[int],
     bins: list[Bins],
@@ -47,7 +44,6 @@ def gather(
     ----------
     scene : SurfaceScene
     surface : Surface
-    frames : SharedFrames
     table : mitsuba.Float
         Per record and light: light by way of the broad lobe (3 numbers) and visibility.
     rows : sequence of int
@@ -89,7 +85,7 @@ def gather(
     cell, first = dr.gather(mi.UInt32, order, lane // blocks), lane % blocks
     view, texel = cell // n_texels, cell % n_texels
     lights = [first + j * blocks for j in range(n_slots)]
-    points, spread = _points(scene, surface, frames, table, rows, bins, (view, cell), lights, variance)
+    points, spread = _points(scene, surface, table, rows, bins, cell, lights, variance)
     drafts = [dr.empty(mi.Float, int(np.prod(shape))) for _ in range(1 + variance)]
     mine = dr.gather(mi.Float, share, cell)
     pooled = None
@@ -190,9 +186,7 @@ def _pooled(radiance: JitArray, n_views: int, texels: tuple[int, int], n_lit: in
     return result
 
 
-def _packets(
-    scene: SurfaceScene, surface: Surface, frames: SharedFrames, rows: Sequence[int], bins: list[Bins]
-) -> JitArray:
+def _packets(scene: SurfaceScene, surface: Surface, rows: Sequence[int], bins: list[Bins]) -> JitArray:
     """What the loop needs to know of an entry, 16 numbers each: computed once, not once per light."""
     import drjit as dr
     import mitsuba as mi
@@ -205,8 +199,7 @@ def _packets(
     wi = mi.Frame3f(s, dr.cross(shading, s), mi.Normal3f(shading)).to_local(w)
     uv = dr.gather(mi.Point2f, surface.uv, record)
     weight, part = (np.concatenate([getattr(some, name) for some in bins]) for name in ("weight", "part"))
-    codes = dr.gather(mi.UInt32, frames.code, record)
-    numbers, records = (mi.Float(dr.reinterpret_array(mi.Float, a)) for a in (codes, record))
+    numbers, records = (mi.Float(dr.reinterpret_array(mi.Float, a)) for a in (number, record))
     weight, part = to_device(mi.Float, weight), to_device(mi.Float, part)
     shape = scene.lobes.shape(number, wi.z)
     return packed([*s, uv.x, *shading, uv.y, *wi, shape, part, numbers, records, weight])
@@ -215,23 +208,22 @@ def _packets(
 def _points(
     scene: SurfaceScene,
     surface: Surface,
-    frames: SharedFrames,
     table: JitArray,
     rows: Sequence[int],
     bins: list[Bins],
-    where: tuple[JitArray, JitArray],
+    cell: JitArray,
     index: list[JitArray],
     variance: bool,
 ) -> tuple[list[JitArray], list[JitArray] | None]:
     """Mean and its variance from the entries: per light of a lane one colour each.
 
-    ``where`` are numbers of the lanes' views and cells, ``index`` those of their lights, which may be beyond the last.
+    ``index`` are numbers of the lanes' lights, which may be beyond the last.
     """
     import drjit as dr
     import mitsuba as mi
 
     lights, lobes, block = scene.lights, scene.lobes, len(index)
-    n_lit, (view, cell) = lights.count, where
+    n_lit = lights.count
     start = starts(bins)
     n_entries, start = int(start[-1]), to_device(mi.UInt32, start)
     begin, end = dr.gather(mi.UInt32, start, cell), dr.gather(mi.UInt32, start, cell + 1)
@@ -239,14 +231,12 @@ def _points(
     zero = dr.zeros(mi.Float, width)
     if n_entries == 0:
         return [mi.Color3f(zero) for _ in range(block)], [mi.Color3f(zero) for _ in range(block)]
-    packets = _packets(scene, surface, frames, rows, bins)
-    index = [dr.minimum(i, n_lit - 1) for i in index]
+    packets = _packets(scene, surface, rows, bins)
+    inside, index = [i < n_lit for i in index], [dr.minimum(i, n_lit - 1) for i in index]
     vectors = [dr.gather(mi.Vector3f, lights.vectors, i) for i in index]
     light_count = dr.opaque(mi.UInt32, n_lit)
     # Direct light by way of broad lobes is in the table where they are the table's.
     context = lobes.drawn if lobes.exact else lobes.full
-    pairs = frames.table(scene.directions[rows], lights, context) if frames.count else None
-    n_rows = dr.opaque(mi.UInt32, len(rows))
 
     def entry_values(entry: JitArray) -> tuple[JitArray, JitArray, JitArray, list[JitArray]]:
         e = unpacked(packets, entry, 16)
@@ -257,19 +247,13 @@ def _points(
         si.uv = mi.Point2f(e[3], e[7])
         si.wi = mi.Vector3f(e[8:11])
         shape, part, weight = e[11], e[12], e[15]
-        code = dr.reinterpret_array(mi.UInt32, e[13])
-        shared = code >= SHARED if pairs is not None else mi.Bool(False)
-        bsdf = dr.reinterpret_array(mi.BSDFPtr, dr.select(shared, 0, code))
-        first_pair = ((code & (SHARED - 1)) * n_rows + view) * light_count
+        bsdf = dr.reinterpret_array(mi.BSDFPtr, dr.reinterpret_array(mi.UInt32, e[13]))
         record = dr.reinterpret_array(mi.UInt32, e[14])
         values = []
         for j in range(block):
             row = dr.gather(mi.Array4f, table, dr.fma(record, light_count, index[j]))
             # Zero where the light is hidden.
-            direct = bsdf.eval(context, si, si.to_local(vectors[j]), (row.w != 0) & ~shared)
-            if pairs is not None:
-                known = dr.gather(mi.Array4f, pairs, first_pair + index[j], shared)
-                direct += mi.Color3f(known.x, known.y, known.z)
+            direct = bsdf.eval(context, si, si.to_local(vectors[j]), (row.w != 0) & inside[j])
             values.append(dr.fma(mi.Color3f(row.x, row.y, row.z), shape, direct * row.w))
         return part, weight, record, values
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from btfref.numerics.device_arrays import to_device
-from btfref.sampling.surface.frames import silent_beside_diffuse, uniform
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -47,10 +46,6 @@ class BroadLobes:
         Whether every broad lobe is the table's, and the rest evaluates by itself.
     drawn : mitsuba.BSDFContext
         Lobes that the rest is sampled by.
-    uniform : dict of int to bool
-        Number of a BSDF -> whether it is the same at all texture coordinates.
-    silent : list of int
-        Numbers of the BSDFs that have no rest, where the broad lobes are exact.
     """
 
     def __init__(self, bsdfs: Sequence[JitArray]) -> None:
@@ -80,8 +75,6 @@ class BroadLobes:
         self.any = bool((used > 0).any())
         self.exact = self.masked and exact
         self.drawn = self.rest if self.masked else self.full
-        self.uniform = {number: uniform(bsdf) for number, bsdf in zip(self.ids, bsdfs, strict=True)}
-        self.silent = silent_beside_diffuse(bsdfs, self.ids) if self.exact else []
         self._kind, self._table = to_device(mi.Float, kind), to_device(mi.Float, tables)
         self.table = tables
 

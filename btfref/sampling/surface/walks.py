@@ -27,7 +27,7 @@ _FIELDS = ("p", "n", "s", "shading", "uv", "number", "albedo")
 
 
 #: What vertices bring: of the numbers of some, a function of a light and the number of its direction.
-Bring: TypeAlias = Callable[[JitArray], Callable[[JitArray, JitArray], JitArray]]
+Bring: TypeAlias = Callable[[JitArray], Callable[[JitArray, JitArray, JitArray], JitArray]]
 
 
 @dataclass
@@ -250,8 +250,9 @@ def connect(lights: Lights, target: JitArray, offset: JitArray, bring: Bring, *,
     offset : mitsuba.UInt32
         Where in ``target`` the first light of each vertex goes; each ``stride`` further. Vertices may share places.
     bring : callable
-        ``bring(i)`` for the numbers of some vertices gives a callable of a light, ``(w, row) -> mitsuba.Color3f``:
-        weight · BSDF · cosine · visibility; row is the number of the light's direction.
+        ``bring(i)`` for the numbers of some vertices gives a callable of a light, ``(w, row, wanted) ->
+        mitsuba.Color3f``: weight · BSDF · cosine · visibility; row is the number of the light's direction, and what is
+        not wanted need not be evaluated.
     """
     import drjit as dr
     import mitsuba as mi
@@ -271,11 +272,14 @@ def connect(lights: Lights, target: JitArray, offset: JitArray, bring: Bring, *,
     chosen = [dr.minimum(k, count - 1) for k in light]
     vectors = [dr.gather(mi.Vector3f, lights.vectors, k) for k in chosen]
     rows = [dr.gather(mi.UInt32, lights.rows, k) for k in chosen]
+    wanted = [k < count for k in light]
     begin, end = dr.gather(mi.UInt32, start, place), dr.gather(mi.UInt32, start, place + 1)
 
     def step(i: JitArray, sums: tuple[JitArray, ...]) -> tuple[JitArray, tuple[JitArray, ...]]:
         from_light = bring(dr.gather(mi.UInt32, order, i))
-        return i + 1, tuple(a + from_light(*light) for a, *light in zip(sums, vectors, rows, strict=True))
+        return i + 1, tuple(
+            a + from_light(*light) for a, *light in zip(sums, vectors, rows, wanted, strict=True)
+        )
 
     zero = dr.zeros(mi.Float, dr.width(lane))
     state = (begin, tuple(mi.Color3f(zero) for _ in chosen))
@@ -284,13 +288,12 @@ def connect(lights: Lights, target: JitArray, offset: JitArray, bring: Bring, *,
 
     def write() -> None:
         for j, value in enumerate(sums):
-            inside = light[j] < count
             for channel in range(3):
                 dr.scatter_add(
                     target,
                     value[channel],
                     dr.fma(light[j], stride, at) + channel,
-                    inside,
+                    wanted[j],
                     mode=dr.ReduceMode.NoConflicts,
                 )
 
@@ -390,17 +393,17 @@ def _bringing(
     surface, what, coded = vertices
     n = dr.opaque(mi.UInt32, cache.n)
 
-    def bring(i: JitArray) -> Callable[[JitArray, JitArray], JitArray]:
+    def bring(i: JitArray) -> Callable[[JitArray, JitArray, JitArray], JitArray]:
         si, bsdf, number, albedo = surface.interaction(i)
         e = unpacked(what, i, 8)
         si.wi, gain = mi.Vector3f(e[:3]), mi.Color3f(e[4:7])
 
-        def from_light(w: JitArray, row: JitArray) -> JitArray:
+        def from_light(w: JitArray, row: JitArray, wanted: JitArray) -> JitArray:
             seen = cache.value(dr.gather(mi.UInt8, coded, dr.fma(i, n, row)))
             local = si.to_local(w)
             if broad:
                 return gain * lobes.value(number, albedo, si.wi, local) * seen
-            return gain * bsdf.eval(lobes.full, si, local, seen != 0) * seen
+            return gain * bsdf.eval(lobes.full, si, local, (seen != 0) & wanted) * seen
 
         return from_light
 
