@@ -15,6 +15,7 @@ from btfref.numerics.device_arrays import to_device
 
 if TYPE_CHECKING:
     from btfref.sampling.surface.estimator import SurfaceEstimator
+    from btfref.types import JitArray
 
 #: Lanes of the kernel; each evaluates all lights.
 LANES = 1 << 20
@@ -76,7 +77,7 @@ def seconds(count: int, seen: np.ndarray, lights: np.ndarray, *, lanes: int = LA
     context = mi.BSDFContext()
     dr.eval(si, bsdf)
 
-    def add(k: object, total: object) -> tuple[object, object]:
+    def add(k: JitArray, total: JitArray) -> tuple[JitArray, JitArray]:
         return k + 1, total + bsdf.eval(context, si, dr.gather(mi.Vector3f, vectors, k))
 
     taken = []

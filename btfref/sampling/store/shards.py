@@ -48,7 +48,7 @@ def write_bytes(path: Path, *parts: np.ndarray | bytes) -> None:
     try:
         with file:
             for part in parts:
-                rest = memoryview(part).cast("B")
+                rest = (part.data if isinstance(part, np.ndarray) else memoryview(part)).cast("B")
                 while len(rest):  # a system may take less than it is given
                     rest = rest[file.write(rest) :]
         os.replace(draft, path)
