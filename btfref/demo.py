@@ -31,9 +31,9 @@ METHODS = ("lpca", "svd", "raw")
 #: The scene that `btfref.rendering.offline.geometry` can replace by the mesostructure itself.
 FLAT = "plane"
 
-#: What is synthesized: 64 × 64 texels and 81 × 81 directions, the default. 16 paths leave a noise that the eye finds
-#: and the gates do not mind, since every renderer shows the same noisy material.
-MESOSTRUCTURE, SPP = "checker", 16
+#: What is synthesized: 64 × 64 texels and 81 × 81 directions, the default. 10 points a texel leave the noise of 16
+#: paths, which the eye finds and the gates do not mind, since every renderer shows the same noisy material.
+MESOSTRUCTURE, SPP = "checker", 10
 
 #: Sub-pixels per axis, the same in both renderers.
 GRID = 4
@@ -168,6 +168,7 @@ class _Chain:
             btf = synthesize(MESOSTRUCTURE, settings, out=store, overwrite=True, progress=self.progress)
             told = ("texels", "views", "lights", "spp", "seed")
             self.synthesis = {"mesostructure": MESOSTRUCTURE} | {k: getattr(settings, k) for k in told}
+            self.synthesis["estimator"] = btf.attributes["estimator"]
         for key in METHODS:
             with self.timed(f"fit {key}"):
                 self.files[key] = (self.output / f"checker.{key}.exr").resolve()

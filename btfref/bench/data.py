@@ -29,7 +29,7 @@ def checker(*, texels: int = 64, spp: int = 2, progress: Progress | None = None)
     """
     from btfref.sampling.synthesis import synthesize
 
-    return synthesize("checker", texels=texels, spp=spp, progress=progress)
+    return synthesize("checker", texels=texels, spp=spp, estimator="path", progress=progress)
 
 
 def materials(

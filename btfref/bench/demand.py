@@ -55,6 +55,9 @@ METHODS = ("raw", "lpca", "laplacian", "rf_lobes", "gbrdf")
 
 BASELINE = "whole"
 
+#: Part of the result -> the estimator that it is about.
+ESTIMATORS = {"synthesis": "path", "surface": "surface"}
+
 
 def run(options: Options) -> Facts:
     """Costs of parts and shares of scenes.
@@ -63,12 +66,13 @@ def run(options: Options) -> Facts:
     ----------
     options : Options
         ``quick``: texels, samples, pictures, rounds and methods as few as a test has time for. ``btf``: what the
-        methods are fitted to; default: a checker. ``only``: among "synthesis" and "scenes".
+        methods are fitted to; default: a checker. ``only``: among "synthesis", "surface" and "scenes".
 
     Returns
     -------
     dict
-        ``synthesis``: seconds, samples and bytes of parts and whole, the law of the cost, whether pictures are equal;
+        ``synthesis``: seconds, samples and bytes of parts and whole by paths, the law of the cost, whether pictures are
+        equal; ``surface``: the same of the surface estimator;
         ``scenes``: by scene, shares needed, and by method those of bytes of maps, bytes read, loading time, peak memory
         of it, and frame time; ``raw``;
         ``parameters``; ``machine``.
@@ -76,14 +80,15 @@ def run(options: Options) -> Facts:
     tell = options.tell
     result = {"suite": "demand", "parameters": {"quick": options.quick}, "machine": machine()}
     with tempfile.TemporaryDirectory() as folder:
-        if options.wants("synthesis"):
-            result["synthesis"] = synthesis(Path(folder), options.quick, tell)
+        for part, estimator in ESTIMATORS.items():
+            if options.wants(part):
+                result[part] = synthesis(Path(folder), estimator, options.quick, tell)
         if options.wants("scenes"):
             result["scenes"] = scenes(Path(folder), options.btf, options.quick, tell)
     return result
 
 
-def synthesis(folder: Path, quick: bool, progress: Progress) -> Facts:
+def synthesis(folder: Path, estimator: str, quick: bool, progress: Progress) -> Facts:
     """Parts that scenes need against the whole: times, their law, bytes, pictures."""
     from btfref.numerics.sphere.directions import directions
     from btfref.sampling.settings import SynthesisSettings
@@ -118,7 +123,9 @@ def synthesis(folder: Path, quick: bool, progress: Progress) -> Facts:
         "its views, one light": Selection(views, lights[:1]),
         "single pair": Selection(views[:1], lights[:1]),
     }
-    settings = SynthesisSettings(texels=texels, spp=spp, views=directions_name, lights=directions_name)
+    settings = SynthesisSettings(
+        texels=texels, spp=spp, views=directions_name, lights=directions_name, estimator=estimator
+    )
     seconds: dict[str, list[float]] = {name: [] for name in parts}
     pairs = {}
     # Parts warm all kernels up: the whole once more would take a minute.
@@ -348,9 +355,11 @@ def _spread(entry: Mapping[str, float], digits: int = 0) -> str:
 def table(result: Facts) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Rows for people: what is needed of what, and what it costs."""
     rows: list[tuple[str, ...]] = []
-    if one := result.get("synthesis"):
+    for kind in ESTIMATORS:
+        if (one := result.get(kind)) is None:
+            continue
         for name, part in one["parts"].items():
-            what = "synthesis: " + (f"of what {name} needs" if name in TRACED else name)
+            what = f"{kind}: " + (f"of what {name} needs" if name in TRACED else name)
             text = f"{part['views']} views, {part['pairs']} pairs: {100 * part['share_of_samples']:.2f} % of samples, "
             text += f"{part['seconds']['median_s']:.2f} s, {_spread(part['seconds'], 2)} of the time, "
             text += f"law {part['law_s']:.2f} s, (time − constant) / samples {part['slope']:.2f}, "
@@ -365,7 +374,7 @@ def table(result: Facts) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
         text += f" + {1e3 * law['pair_s']:.2f} ms per pair"
         if law["lights_per_view"] is not None:
             text += f"; a view costs as much as {law['lights_per_view']:.1f} lights"
-        rows.append(("synthesis: law", "", f"{text}; off by {100 * law['largest_residual']:.0f} % at most"))
+        rows.append((f"{kind}: law", "", f"{text}; off by {100 * law['largest_residual']:.0f} % at most"))
     for scene, entry in result.get("scenes", {}).items():
         rows += [(scene, what, f"{100 * share:.1f} %") for what, share in entry["shares"].items()]
         for key, costs in entry["methods"].items():

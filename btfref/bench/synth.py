@@ -71,7 +71,9 @@ def run(options: Options) -> Facts:
     -------
     dict
         ``summary``: one row per mesostructure and method, see `summary`; ``raw``: seconds of every round per
-        mesostructure and method; ``kernel_s``, those of the naive loop that its kernels take; ``errors``;
+        mesostructure and method; ``kernel_s``, those of the naive loop that its kernels take; ``values``, how many BSDF
+        values the surface estimator sums up, and ``floor_s``, seconds of Mitsuba's own `eval` for as many
+        (`btfref.bench.floor`); ``errors``;
         ``means``: the images' means of every run, and ``reference``, those of the reference's rounds;
         ``peak_bytes``; ``growth``: one row per setting; ``parameters``; ``machine``.
 
@@ -89,7 +91,8 @@ def run(options: Options) -> Facts:
     rounds, texels = (1, 16) if options.quick else (3, 64)
     count = dict.fromkeys(RUNS, 4) if options.quick else RUNS
     steps = _Steps(options.progress, names, settings, rounds, count)
-    result: Facts = {"raw": {}, "errors": {}, "means": {}, "reference": {}, "peak_bytes": {}, "kernel_s": {}}
+    keys = ("raw", "errors", "means", "reference", "peak_bytes", "kernel_s", "floor_s", "values")
+    result: Facts = {key: {} for key in keys}
     with tempfile.TemporaryDirectory() as folder:
         for name in names:
             job = {"mesostructure": name, "texels": texels, "reference": str(Path(folder) / f"{name}.npz")}
@@ -129,7 +132,8 @@ def methods(name: str) -> dict[str, tuple[str, int, int]]:
 
 def _measured(job: Facts, rounds: int, count: Mapping[str, int], steps: _Steps) -> dict[str, Facts]:
     """All methods of one mesostructure in turn: parts of the result by label."""
-    parts: dict[str, Facts] = {"raw": {}, "errors": {}, "means": {}, "peak_bytes": {}, "kernel_s": {}}
+    lists = {"seconds": "raw", "errors": "errors", "kernel_s": "kernel_s", "floor_s": "floor_s"}
+    parts: dict[str, Facts] = {key: {} for key in (*lists.values(), "means", "peak_bytes", "values")}
     with ExitStack() as stack:
         processes = {}
         for label, (task, spp, _) in methods(job["mesostructure"]).items():
@@ -143,11 +147,12 @@ def _measured(job: Facts, rounds: int, count: Mapping[str, int], steps: _Steps) 
                 answer = processes[label].answer({"seed": seed, "timed": timed})
                 parts["means"].setdefault(label, []).append(answer["means"])
                 if timed:
-                    parts["raw"].setdefault(label, []).append(answer["seconds"])
-                    parts["errors"].setdefault(label, []).append(answer["errors"])
-                    parts["peak_bytes"][label] = answer["peak_bytes"]
-                    if "kernel_s" in answer:
-                        parts["kernel_s"].setdefault(label, []).append(answer["kernel_s"])
+                    for key, part in lists.items():
+                        if key in answer:
+                            parts[part].setdefault(label, []).append(answer[key])
+                    for key in ("peak_bytes", "values"):
+                        if key in answer:
+                            parts[key][label] = answer[key]
                 steps.add(task, spp)
     return parts
 
@@ -260,9 +265,9 @@ def summary(result: Facts) -> list[Facts]:
     -------
     list of dict
         ``mesostructure``, ``method``; ``seconds``, and paired ratios to it of the naive loop (``naive``), of what its
-        kernels take (``kernels``) and of paths (``path``), of the samples whose error is asked for: ``[median, least,
-        largest]`` each; ``rmse``, ``trimmed``, ``mae``: medians of the rounds; ``equal_error``: whether none of
-        them is above the naive loop's; what `bias` tells; ``peak_bytes``.
+        kernels take (``kernels``) and of paths (``path``), of the samples whose error is asked for, and of it to the
+        floor of those (``floor``): ``[median, least, largest]`` each; ``rmse``, ``trimmed``, ``mae``: medians of the
+        rounds; ``equal_error``: whether none of them is above the naive loop's; what `bias` tells; ``peak_bytes``.
     """
     rows = []
     for name, raw in result["raw"].items():
@@ -281,6 +286,8 @@ def summary(result: Facts) -> list[Facts]:
                 "path": raw[f"path {SAMPLES[level]}"],
             }
             ratios = {key: [a / b for a, b in zip(some, seconds, strict=True)] for key, some in peers.items()}
+            floor = result["floor_s"][name][f"surface {POINTS[name][level]}"]
+            ratios["floor"] = [b / a for a, b in zip(floor, seconds, strict=True)]
             spread = {"seconds": seconds} | ratios
             rows.append(
                 {"mesostructure": name, "method": label}
@@ -297,7 +304,7 @@ def table(result: Facts) -> tuple[list[str], list[list[str]]]:
     """Header and rows for a reader; ratios and seconds are medians with the least and the largest round."""
     header = ["mesostructure", "method", "s", "RMSE", "RMSE w/o 1 %", "MAE"]
     header += [f"|z| ≤ {result['parameters']['z_limit']:.1f}?", "seen from %", "bias %"]
-    header += ["naive / it", "its kernels / it", "paths / it", "MiB"]
+    header += ["naive / it", "its kernels / it", "paths / it", "it / floor", "MiB"]
     rows = []
     for row in result["summary"]:
         seen = statistics.median(row["seen"])
@@ -305,7 +312,7 @@ def table(result: Facts) -> tuple[list[str], list[list[str]]]:
         cells += [f"{row[key]:.4f}" for key in ("rmse", "trimmed", "mae")]
         cells += [f"{row['z']:.1f}", f"{100 * seen:.2f}"]
         cells += [f"{100 * row['bias']:+.2f} ± {100 * row['half_width']:.2f}"]
-        cells += [_spread(row[key], ".3g") for key in ("naive", "kernels", "path")]
+        cells += [_spread(row[key], ".3g") for key in ("naive", "kernels", "path", "floor")]
         rows.append([*cells, f"{row['peak_bytes'] / 2**20:.0f}"])
     for row in result["growth"]:
         setting = f"surface {row['spp']}, {row['texels']}², {row['n_directions']}², depth {row['max_depth']}"

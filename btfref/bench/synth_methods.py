@@ -283,16 +283,22 @@ class SharedPoints(_Subject):
 
     def time(self, seed: int) -> dict[str, float]:
         """Seconds of a whole BTF in memory: images alone, as the naive loop makes them."""
-        from btfref.sampling.synthesis import synthesize
+        from btfref.bench import floor
+        from btfref.sampling.surface.estimator import SurfaceEstimator
 
         gc.collect()
+        every, n = range(len(self.vectors)), len(self.vectors)
         start = time.perf_counter()
-        btf = synthesize(self.job["mesostructure"], texels=self.texels, spp=self.spp, estimator="surface",
-                         views=self.vectors, lights=self.vectors, max_depth=MAX_DEPTH, seed=seed,
-                         dtype="float32", variance=False)  # fmt: skip
+        values = np.zeros((n, n, self.texels, self.texels, 3), np.float32)
+        made = SurfaceEstimator(
+            self.tile, self.vectors, views=self.vectors, variance=False, seed=seed, **self.settings
+        )
+        for view, mean, _ in made.all_views(every):
+            values[view] = mean
         seconds = time.perf_counter() - start
-        self.full[seed] = btf.values[self.pairs[:, 0], self.pairs[:, 1]]
-        return {"seconds": seconds}
+        self.full[seed] = values[self.pairs[:, 0], self.pairs[:, 1]]
+        count, seen = floor.values_of(made)
+        return {"seconds": seconds, "floor_s": floor.seconds(count, seen, self.vectors), "values": count}
 
     def images(self, seed: int) -> np.ndarray:
         """Images of the pairs, of the whole BTF where it was made; else points and walks of their directions alone."""

@@ -5,6 +5,7 @@ An interrupted run continues where it stopped when it is started again with the 
 it now, and the same command with another part, or without, fills more later (btfref info says what is there).
 
   btfref synth checker -o checker.btf.zarr --views ubo81 --lights ubo81 --spp 16
+  btfref synth checker -o checker.btf.zarr --estimator path --spp 16
   btfref synth stone.png -o stone.btf.zarr --albedo stone-colour.png --roughness 0.6 --amplitude 0.1
   btfref synth Bricks076_2K/ -o bricks.btf.zarr --amplitude 0.05
   btfref synth cloth.glb -o cloth.btf.zarr --target-error 0.02 --memory 4G
@@ -33,7 +34,7 @@ from btfref.commands.shared.reading import (
 )
 from btfref.errors import SAMPLES as MANY_SAMPLES
 from btfref.errors import WORKERS, InputError
-from btfref.sampling.settings import ESTIMATORS, MOST_SAMPLES, SAMPLES, SynthesisSettings
+from btfref.sampling.settings import AUTO, ESTIMATORS, MOST_SAMPLES, SAMPLES, SynthesisSettings
 from btfref.types import Facts
 
 #: Options that are parameters of a user's mesh or height map.
@@ -99,9 +100,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument(
         "--estimator",
-        choices=tuple(ESTIMATORS),
+        choices=(AUTO, *ESTIMATORS),
         default=default.estimator,
-        help="path: the reference; surface: visibility traced once for all views and lights (default %(default)s)",
+        help="path: the reference; surface: visibility traced once for all views and lights; auto: surface where it "
+        "applies, path where a material transmits, mirrors or masks (default %(default)s)",
     )
     parser.add_argument(
         "--no-variance",
@@ -198,6 +200,8 @@ def run(args: Namespace) -> int:
     job = make_job(args.mesostructure, settings, parameters)
     for line in job.mesostructure.ignored:
         sys.stderr.write(f"btfref: warning: ignored: {printable(line)}\n")
+    if not args.json:
+        emit(f"estimator: {job.attributes.get('fallback', job.settings.estimator)}")
     peak: list[int] = []
     with Progress() as progress:
         store = job.to_store(

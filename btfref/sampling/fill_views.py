@@ -13,6 +13,7 @@ import numpy as np
 from btfref.sampling.memory import blocks
 from btfref.sampling.paths import adaptive
 from btfref.sampling.store.selection import Selection
+from btfref.sampling.store.writing import Writer
 from btfref.sampling.variant import mitsuba_variant
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ def fill_views(
     memory : int
         Budget of this process, bytes.
     done : callable, optional
-        Called as ``done(view)`` after each view.
+        Called as ``done(view)`` when a view is made; it may still be on its way to its files.
 
     Raises
     ------
@@ -84,8 +85,8 @@ def fill_views(
         ("surface", "pilot"): _pilot_by_views,
         ("surface", "synthesis"): _fill_by_views if plan is None else _fill_by_passes,
     }[job.settings.estimator, stage]
-    with mitsuba_variant(job.settings.variant):
-        for view in work(job, store, views, only or Selection(), plan, size):
+    with mitsuba_variant(job.settings.variant), Writer(store, size.queue) as writer:
+        for view in work(job, writer, views, only or Selection(), plan, size):
             if done is not None:
                 done(view)
 
@@ -108,8 +109,9 @@ def _regions(store: BTFStore) -> Iterator[tuple[slice, slice, np.ndarray]]:
 
 
 def _fill_by_texels(
-    job: Job, store: BTFStore, views: list[int], only: Selection, plan: Plan | None, size: Blocks
+    job: Job, writer: Writer, views: list[int], only: Selection, plan: Plan | None, size: Blocks
 ) -> Iterator[int]:
+    store = writer.store
     *_, tiles = only.indices(store)
     pairs = only.wanted(store)
     wanted = np.zeros(store.coverage_shape, bool)
@@ -130,7 +132,7 @@ def _fill_by_texels(
             if plan is not None:
                 _record_part(store, request.view, row, column, inside, adaptive.texel_means(*result))
             origin = (row.start, column.start)
-            store.write_part(request.view, request.lights, tuple(chosen), *result, origin=origin)
+            writer.write_part(request.view, request.lights, tuple(chosen), *result, origin=origin)
         if last:
             yield request.view
 
@@ -169,8 +171,9 @@ def _tile_of(part: slice, side: int) -> np.ndarray:
 
 
 def _pilot_by_texels(
-    job: Job, store: BTFStore, views: list[int], only: Selection, plan: Plan | None, size: Blocks
+    job: Job, writer: Writer, views: list[int], only: Selection, plan: Plan | None, size: Blocks
 ) -> Iterator[int]:
+    store = writer.store
     estimator = job.make_estimator(views, buffer=size.buffer)
     columns = store.texels[1]
     for view in views:
@@ -189,8 +192,9 @@ def _pilot_by_texels(
 
 
 def _fill_by_views(
-    job: Job, store: BTFStore, views: list[int], only: Selection, plan: Plan | None, size: Blocks
+    job: Job, writer: Writer, views: list[int], only: Selection, plan: Plan | None, size: Blocks
 ) -> Iterator[int]:
+    store = writer.store
     *_, tiles = only.indices(store)
     pairs = only.wanted(store)
     mask = None if len(tiles[0]) == np.prod(store.coverage_shape) else only.mask(store)
@@ -204,7 +208,7 @@ def _fill_by_views(
                 some = slice(None) if mine.all() else mine
                 if mine.any():
                     spread = variance[some] if store.has_variance else None
-                    store.write_part(view, chosen[mine], tiles, mean[some], spread)
+                    writer.write_part(view, chosen[mine], tiles, mean[some], spread)
                 if len(chosen) == len(lights):
                     yield view
             del estimator
@@ -238,8 +242,9 @@ def _passes(
 
 
 def _fill_by_passes(
-    job: Job, store: BTFStore, views: list[int], only: Selection, plan: Plan | None, size: Blocks
+    job: Job, writer: Writer, views: list[int], only: Selection, plan: Plan | None, size: Blocks
 ) -> Iterator[int]:
+    store = writer.store
     assert plan is not None, "passes are counted by a plan"
     _, lights, tiles = only.indices(store)
     counts = {view: plan.counts(store.read_map("pilot", view)) for view in views}
@@ -251,13 +256,14 @@ def _fill_by_passes(
             store.write_map("samples", view, counts[view] * adaptive.SURFACE_POINTS)
         for view, mean, variance in _passes(job, group, passes):
             store.write_map("reached", view, adaptive.texel_means(mean, variance))
-            store.write_part(view, lights, tiles, mean, variance)
+            writer.write_part(view, lights, tiles, mean, variance)
             yield view
 
 
 def _pilot_by_views(
-    job: Job, store: BTFStore, views: list[int], only: Selection, plan: Plan | None, size: Blocks
+    job: Job, writer: Writer, views: list[int], only: Selection, plan: Plan | None, size: Blocks
 ) -> Iterator[int]:
+    store = writer.store
     for group in _groups(views, size.views):
         estimator = job.make_estimator(group, spp=adaptive.SURFACE_POINTS, stream=(_PILOT, 0))
         for view, mean, variance in estimator.all_views(group):

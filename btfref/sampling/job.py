@@ -19,7 +19,7 @@ from btfref.registry.points import imported
 from btfref.sampling.fallback import reason_against_surface
 from btfref.sampling.paths import adaptive
 from btfref.sampling.scheduling import run
-from btfref.sampling.settings import ESTIMATORS, SynthesisSettings
+from btfref.sampling.settings import AUTO, ESTIMATORS, SynthesisSettings
 from btfref.sampling.store.layout import remove_leftovers, remove_store
 from btfref.sampling.store.lock import writing
 from btfref.sampling.store.resume import resumable
@@ -49,7 +49,7 @@ class Job:
     Attributes
     ----------
     settings : SynthesisSettings
-        Those asked for, but for the estimator where "path" takes the place of "surface".
+        Those asked for, with the estimator that is used: "path" or "surface".
     mesostructure : Mesostructure
     views, lights : DirectionSet
     texels : (int, int)
@@ -73,10 +73,13 @@ class Job:
         with mitsuba_variant(settings.variant):
             bsdfs = [load_bsdf(part) for part in self.mesostructure.parts]
             fallback = None
-            if settings.estimator == "surface":
+            if settings.estimator != "path":
                 fallback = reason_against_surface(bsdfs, self.mesostructure.parts)
-        if fallback is not None:
-            settings = dataclasses.replace(settings, estimator="path")
+        if fallback is None and settings.estimator == AUTO and settings.texel_error is not None:
+            fallback = "each texel has a limit of its own"
+        if settings.estimator == AUTO or fallback is not None:
+            used = "surface" if fallback is None else "path"
+            settings = dataclasses.replace(settings, estimator=used)
         self.settings = settings
         self.attributes = {
             **settings.attributes(),

@@ -12,9 +12,13 @@ from btfref.errors import InputError
 #: Bytes of a process that holds nothing of the BTF yet: interpreter, Mitsuba, kernels, scene of a small tile.
 BASE = 350 << 20
 
-#: Bytes per value (view, light, texel, channel) of what is made together: mean and variance as computed, as
-#: stored, and Zarr's encoded shards of both.
+#: Bytes per value (view, light, texel, channel) of what is made together: mean and variance as they are made, those
+#: that are being written, and the bytes of their files.
 PER_VALUE = 28
+
+#: Bytes of the surface estimator's results that wait to be written: about what it makes at a time, so that writing and
+#: tracing go on side by side.
+QUEUE = 128 << 20
 
 #: Peak of a pass of paths in sizes of its sample buffer: the samples, their squares and what is summed.
 BUFFERS = 4
@@ -47,11 +51,14 @@ class Blocks:
         Bytes of the sample buffer of the path estimator.
     views, lights : int
         Views and lights that the surface estimator makes together.
+    queue : int
+        Bytes that wait to be written; 0 for one part of any size.
     """
 
     buffer: int
     views: int
     lights: int
+    queue: int = 0
 
 
 #: Bytes of a process that converts or fits, before it holds anything: interpreter, NumPy, SciPy, Zarr, OpenEXR.
@@ -182,9 +189,9 @@ def blocks(
     for lights in sorted({-(-n_lights // k) for k in parts}, reverse=True):
         for views in sorted({-(-n_views // k) for k in (1, 2, 3, 4, 6, 8)}, reverse=True):
             if need(views, lights) <= free:
-                return Blocks(BUFFER_RANGE[1], views, lights)
+                return Blocks(BUFFER_RANGE[1], views, lights, QUEUE)
         if need(1, lights) <= free:
-            return Blocks(BUFFER_RANGE[1], 1, lights)
+            return Blocks(BUFFER_RANGE[1], 1, lights, QUEUE)
     refuse(budget, budget - free + need(1, lights))
 
 

@@ -24,6 +24,9 @@ ESTIMATORS = {
     "surface": "btfref.sampling.surface.estimator:SurfaceEstimator",
 }
 
+#: In place of a name: the fastest of them that applies.
+AUTO = "auto"
+
 #: Types that values are stored in.
 DTYPES = ("float16", "float32")
 
@@ -53,10 +56,11 @@ class SynthesisSettings:
         As in Mitsuba: 2 is direct light only, −1 has no limit.
     dtype : {"float16", "float32"}
         Type of the stored values. Variance is float32.
-    estimator : {"path", "surface"}
+    estimator : {"auto", "path", "surface"}
         "path", the reference, or "surface", which traces visibility once for all views and lights; see
-        `btfref.sampling.surface.estimator`. Where a material transmits, masks or mirrors, "path" takes its place
-        and the attribute ``fallback`` says so.
+        `btfref.sampling.surface.estimator`. "auto" is "surface" where that applies and "path" where a material
+        transmits, masks or mirrors, and for a limit per texel, since only paths give each texel samples of its own. The
+        attribute ``estimator`` of a store says which it was, and ``fallback`` why "surface" was not used.
     variant : str
         Mitsuba variant; bytes differ between backends.
     target_error : float, optional
@@ -81,7 +85,7 @@ class SynthesisSettings:
     seed: int = 0
     max_depth: int = 8
     dtype: str = "float16"
-    estimator: str = "path"
+    estimator: str = AUTO
     variant: str = "llvm_ad_rgb"
     target_error: float | None = None
     texel_error: float | None = None
@@ -109,12 +113,12 @@ class SynthesisSettings:
             raise InputError(
                 "type of the values", field="dtype", got=repr(self.dtype), expected=" or ".join(DTYPES)
             )
-        if self.estimator not in ESTIMATORS:
+        if self.estimator not in (AUTO, *ESTIMATORS):
             raise InputError(
                 "unknown estimator",
                 field="estimator",
                 got=repr(self.estimator),
-                expected=f"one of {', '.join(ESTIMATORS)}",
+                expected=f"one of {', '.join((AUTO, *ESTIMATORS))}",
             )
         # These are checked by being made.
         _ = self.sides, self.samples, self.view_set, self.light_set

@@ -39,7 +39,7 @@ def synthesize(
     workers: int | None = None,
     **keywords: Any,
 ) -> SampledBTF:
-    """Path trace a mesostructure into a sampled BTF.
+    """Trace a mesostructure into a sampled BTF.
 
     Parameters
     ----------

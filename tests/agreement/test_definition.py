@@ -54,7 +54,7 @@ def made(tmp_path_factory):
     def get(name):
         path = folder / f"{name}.svd.exr"
         if not path.exists():
-            btf = synthesize(name, texels=8, views="10x5", lights="10x5", spp=2)
+            btf = synthesize(name, texels=8, views="10x5", lights="10x5", spp=2, estimator="path")
             save(methods()["svd"].fit(btf, components=1), path)
         return str(path)
 

@@ -59,6 +59,7 @@ def btf(need, mesostructure, vectors):
         max_depth=MAX_DEPTH,
         dtype="float32",
         seed=5,
+        estimator="path",
     )
 
 
@@ -153,6 +154,7 @@ def test_direct_light_alone_is_caught(mesostructure, vectors, btf, plain):
         max_depth=2,
         dtype="float32",
         seed=6,
+        estimator="path",
     )
     assert not _passes(btf, plain, direct.values)
 

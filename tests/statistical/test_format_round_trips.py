@@ -20,7 +20,7 @@ FEW = directions("ubo81").vectors[:7]
 
 @pytest.fixture(scope="module", params=["checker", "rings", "tissue"])
 def material(request):
-    return synthesize(request.param, texels=8, views=FEW, lights=FEW, spp=4)
+    return synthesize(request.param, texels=8, views=FEW, lights=FEW, spp=4, estimator="path")
 
 
 #: Format, settings, and the gate of the largest error over the largest value; None: the stored bits themselves.

@@ -54,7 +54,7 @@ def files(need, tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("btf")
     vectors = directions("ubo81").vectors[:19]
-    settings = {"views": vectors, "lights": vectors, "spp": 16, "texels": 8}
+    settings = {"views": vectors, "lights": vectors, "spp": 16, "texels": 8, "estimator": "path"}
     for name, parameters in (("flat", {"reflectance": 0.4}), ("checker", {"resolution": 32})):
         save(raw.fit(synthesize(name, **settings, **parameters)), folder / f"{name}.raw.exr")
     return folder

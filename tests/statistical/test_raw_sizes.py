@@ -21,6 +21,7 @@ def test_raw_sizes_of_the_factorization_paper(tmp_path, name, views):
     texels, directions_, size = RAW[name]
     store = synthesize_store(
         tmp_path / "a.btf.zarr", name, texels=texels, views=directions_, lights=directions_, spp=2, max_depth=2,
+        estimator="path",
         only=None if views is None else Selection(views=views), variance=False,
     )  # fmt: skip
     assert store.complete == (views is None)

@@ -43,7 +43,7 @@ def cluster(need):
 
 
 @pytest.mark.filterwarnings("default")
-@pytest.mark.parametrize("extra", [{}, {"estimator": "surface"}, {"target_error": 0.1}])
+@pytest.mark.parametrize("extra", [{}, {"estimator": "path"}, {"estimator": "path", "target_error": 0.1}])
 def test_workers_write_the_same_bytes(tmp_path, cluster, extra):
     alone, shared = tmp_path / "alone.btf.zarr", tmp_path / "shared.btf.zarr"
     synthesize_store(alone, "checker", **SETTINGS, **extra)
@@ -160,6 +160,8 @@ def test_a_scheduler_that_dies_is_one_line_and_the_run_goes_on(tmp_path, need):
         "256",
         "--set",
         "resolution=16",
+        "--estimator",
+        "path",
     ]
     command = [sys.executable, "-m", "btfref", "synth", "checker", *settings, "-o"]
     try:

@@ -55,7 +55,7 @@ def test_image_means_equal_plain_renders(llvm, name):
 def test_texels_equal_those_of_the_path_estimator(depth):
     settings = {"texels": 8, "views": "2x3", "lights": "2x4", "dtype": "float32", "max_depth": depth}
     tile = build("checker", resolution=32, raised_roughness=0.3)
-    path = synthesize(tile, spp=1024, seed=1, **settings)
+    path = synthesize(tile, spp=1024, seed=1, estimator="path", **settings)
     surface = synthesize(tile, spp=64, seed=2, estimator="surface", **settings)
     z = (surface.values - path.values) / np.sqrt(surface.variance + path.variance + 1e-12)
     p = welch_test(surface.values, surface.variance, path.values, path.variance)[1]
@@ -77,7 +77,7 @@ def test_variance_is_honest():
 @pytest.mark.parametrize("bsdf", [None, {"type": "roughconductor", "alpha": 0.3, "material": "Au"}])
 def test_flat_tiles_equal_their_eval(bsdf):
     settings = {"texels": 2, "views": "3x4", "lights": "3x5", "dtype": "float32", "bsdf": bsdf}
-    path = synthesize("flat", spp=2, **settings)
+    path = synthesize("flat", spp=2, estimator="path", **settings)
     surface = synthesize("flat", spp=16, estimator="surface", **settings)
     error = np.abs(surface.values - path.values).max() / path.values.max()
     assert error <= tolerance("synthesis.flat_eval")
@@ -89,7 +89,7 @@ def test_holes_are_black():
         "texels": 16, "views": "2x3", "lights": "2x3", "max_depth": 2, "dtype": "float32",
         "backing_colour": None,
     }  # fmt: skip
-    path = synthesize("tissue", spp=256, **settings)
+    path = synthesize("tissue", spp=256, estimator="path", **settings)
     surface = synthesize("tissue", spp=64, estimator="surface", **settings)
     assert abs(surface.values.mean() / path.values.mean() - 1) <= tolerance("synthesis.surface.holes")
 
@@ -152,6 +152,7 @@ def test_paths_take_over_where_points_cannot(bsdf, word):
     settings = SMALL | {"texels": 2, "bsdf": bsdf}
     made = synthesize("flat", **settings)
     assert made.attributes["estimator"] == "path"
+    assert synthesize("flat", **settings | {"estimator": "auto"}).attributes == made.attributes
     assert word in made.attributes["fallback"]
     assert np.array_equal(made.values, synthesize("flat", **settings | {"estimator": "path"}).values)
     assert "fallback" not in synthesize("flat", **SMALL | {"texels": 2}).attributes

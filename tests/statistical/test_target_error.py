@@ -17,7 +17,7 @@ from btfref.sampling.synthesis import synthesize, synthesize_store
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
-SETTINGS = {"texels": 16, "views": "2x4", "lights": "2x4", "dtype": "float32"}
+SETTINGS = {"texels": 16, "views": "2x4", "lights": "2x4", "dtype": "float32", "estimator": "path"}
 
 
 @pytest.fixture(scope="module")
@@ -38,8 +38,7 @@ def test_the_target_is_reached_with_honest_variance(tmp_path, tile, estimator, t
             tile,
             seed=seed,
             target_error=target,
-            estimator=estimator,
-            **SETTINGS,
+            **SETTINGS | {"estimator": estimator},
         )
         for seed in (1, 2)
     ]
@@ -109,6 +108,7 @@ def test_tiles_are_resumed(tmp_path, tile, monkeypatch):
     """Views of several files: an interruption between two of them loses one file at most."""
     monkeypatch.setattr(layout, "SHARD", 12 * 64 * 64 * 8 * 2)
     settings = {"texels": 192, "views": [[0, 0, 1.0]], "lights": "2x4", "spp": 2, "max_depth": 2}
+    settings |= {"estimator": "path"}
     whole = synthesize_store(tmp_path / "whole.btf.zarr", tile, **settings)
     assert whole.shard == (1, 2)
     killed = tmp_path / "killed.btf.zarr"

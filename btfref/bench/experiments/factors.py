@@ -78,7 +78,13 @@ def run(options: Options) -> Facts:
         )
     report = options.tell
     timed = options.btf or synthesize(
-        "checker", texels=64, views="8x8", lights="8x8", spp=DRAFT_SPP, progress=options.progress
+        "checker",
+        texels=64,
+        views="8x8",
+        lights="8x8",
+        spp=DRAFT_SPP,
+        estimator="path",
+        progress=options.progress,
     )
     rounds = 1 if options.quick else 3
     raw: dict[str, list[float]] = {
@@ -102,7 +108,9 @@ def run(options: Options) -> Facts:
         errors[name], ranges[name] = judged(timed, variants, kept, report)
     else:
         kept.clear()
-        for name, data in materials(None, MESOSTRUCTURES, texels=64, spp=SPP, progress=options.progress):
+        for name, data in materials(
+            None, MESOSTRUCTURES, texels=64, spp=SPP, estimator="path", progress=options.progress
+        ):
             errors[name], ranges[name] = judged(data, variants, {}, report)
     return {
         "suite": "factors",

@@ -56,7 +56,9 @@ def run(options: Options) -> Facts:
         )
     names = MESOSTRUCTURES[:1] if options.quick else MESOSTRUCTURES
     summary, raw = {}, {}
-    for name, data in materials(options.btf, names, texels=TEXELS, spp=SPP, progress=options.progress):
+    for name, data in materials(
+        options.btf, names, texels=TEXELS, spp=SPP, estimator="path", progress=options.progress
+    ):
         summary[name] = {column: fitted(data, key) for column, key in columns.items()}
         raw[name] = {column: row["seconds"] for column, row in summary[name].items()}
     parameters = (

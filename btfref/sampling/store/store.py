@@ -6,6 +6,7 @@ import errno
 import os
 import shutil
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar, cast
 
@@ -18,6 +19,7 @@ from btfref.outputs import refuse_existing, require_folder_of
 from btfref.sampling.store.arrays import Choice, StoredArray, along_axis
 from btfref.sampling.store.facts import store_facts
 from btfref.sampling.store.layout import DRAFT, TILE, attributes_of, check_finite, write_headers
+from btfref.sampling.store.shards import Shards, read_chunk, write_chunk
 
 if TYPE_CHECKING:
     from zarr.storage import StoreLike
@@ -138,6 +140,7 @@ class BTFStore:
         import zarr
 
         self.path = Path(path)
+        self._local = store is None
         self.attributes = attributes_of(self.path)
         self._group = self._guard("zarr.json", lambda: zarr.open_group(store or str(self.path), mode="r+"))
         self._values = self._array("values", 5)
@@ -167,6 +170,11 @@ class BTFStore:
             raise InputError(
                 "variance and values do not fit", file=self.path, field="variance", got=self._variance.shape
             )
+        self._shards = {
+            name: self._shards_of(name, array)
+            for name, array in (("values", self._values), ("variance", self._variance))
+            if array is not None
+        }
 
     def __repr__(self) -> str:
         kind = f"BTFStore {self.dtype}"
@@ -194,6 +202,12 @@ class BTFStore:
             raise InputError("damaged store", file=self.path, field=name, expected=f"an array of {ndim} axes")
         return array
 
+    def _shards_of(self, name: str, array: StoredArray) -> Shards:
+        """The files of an array."""
+        chunk, shard = array.chunks, array.shards or array.chunks
+        grid = (shard[1], shard[2] // chunk[2], shard[3] // chunk[3])
+        return Shards(self.path / name, np.dtype(array.dtype), (chunk[2], chunk[3]), grid)
+
     def _directions(self, name: str, spec: str) -> DirectionSet:
         array = self._array(name, 2)
         return checked(self._guard(name, lambda: array[:]), spec, file=self.path)
@@ -201,7 +215,9 @@ class BTFStore:
     @property
     def coverage(self) -> np.ndarray:
         """Which parts are there: bool, shape (views, lights, tile rows, tile columns)."""
-        return self._guard("coverage", lambda: self._coverage[:]) == 1
+        if not self._local:
+            return self._guard("coverage", lambda: self._coverage[:]) == 1
+        return np.stack([self.covered(view) for view in range(len(self.views))])
 
     @property
     def complete(self) -> bool:
@@ -227,7 +243,8 @@ class BTFStore:
 
     def covered(self, view: int) -> np.ndarray:
         """Which parts of a view are there: bool, shape (lights, tile rows, tile columns)."""
-        return self._guard("coverage", lambda: self._coverage[int(view)]) == 1
+        marks = self._guard("coverage", partial(self._marks, int(view)))
+        return np.zeros(self._coverage.shape[1:], bool) if marks is None else marks[0] == 1
 
     def write_map(self, name: str, view: int, values: np.ndarray) -> None:
         """Write a view of an array that `maps` gives."""
@@ -308,11 +325,11 @@ class BTFStore:
         places = np.stack(tiles, 1)
         end = [min(n, (last + 1) * t) - o for n, last, t, o in zip(
             self.texels, places.max(0), self.tile, origin, strict=True)]  # fmt: skip
-        for field, array, target in (
-            ("values", values, self._values),
-            ("variance", variance, self._variance),
+        for field, array, shards in (
+            ("values", values, self._shards["values"]),
+            ("variance", variance, self._shards.get("variance")),
         ):
-            if array is None or target is None:
+            if array is None or shards is None:
                 continue
             shape = (len(lights), *array.shape[1:3], 3)
             if array.shape != shape or array.shape[1] < end[0] or array.shape[2] < end[1]:
@@ -320,66 +337,63 @@ class BTFStore:
                 raise InputError(
                     "wrong shape", file=self.path, field=field, got=array.shape, expected=expected
                 )
-            for shard in np.unique(places // self.shard, axis=0):
-                inside = places[(places // self.shard == shard).all(1)]
-                self._write_shard(target, field, int(view), lights, inside, shard, array, origin)
-        marks = self._guard("coverage", lambda: self._coverage[int(view)])
-        for row, column in places:
-            marks[lights, row, column] = 1
-        self._guard("coverage", lambda: self._coverage.__setitem__(int(view), marks))
+            self._check(array, places, origin, shards.dtype, field)
+            self._write_shards(shards, field, int(view), np.asarray(lights), places, array, origin)
+        self._guard("coverage", lambda: self._mark(int(view), lights, places))
 
-    def _write_shard(
+    def _check(
+        self, array: np.ndarray, places: np.ndarray, origin: tuple[int, int], dtype: np.dtype, field: str
+    ) -> None:
+        """InputError for a value that is not finite or beyond a type, with its place."""
+        corner = [k * t - o for k, t, o in zip(places.min(0), self.tile, origin, strict=True)]
+        spans = places.max(0) - places.min(0) + 1
+        whole = len(places) == spans.prod()
+        for first in [corner] if whole else places * self.tile - origin:
+            sides = spans * self.tile if whole else self.tile
+            part = array[:, first[0] : first[0] + sides[0], first[1] : first[1] + sides[1]]
+            with np.errstate(over="ignore"):
+                # Rounding keeps the order, and what is no number is both the least and the largest.
+                if np.isfinite([dtype.type(part.min()), dtype.type(part.max())]).all():
+                    continue
+                check_finite(part.astype(dtype), self.path, field)
+
+    def _write_shards(
         self,
-        target: StoredArray,
+        shards: Shards,
         field: str,
         view: int,
         lights: np.ndarray,
-        tiles: np.ndarray,
-        shard: np.ndarray,
+        places: np.ndarray,
         array: np.ndarray,
         origin: tuple[int, int],
     ) -> None:
-        """Write tiles of one shard; what the file has beside them is kept."""
-        rows, columns = (
-            slice(k * s * t, min((k + 1) * s * t, n))
-            for k, s, t, n in zip(shard, self.shard, self.tile, self.texels, strict=True)
-        )
-        # Few lights of many: what lies before the first and behind the last one is not touched.
-        span = slice(int(lights.min()), int(lights.max()) + 1)
-        place = (view, span, rows, columns)
-        within = np.array([rows.start, columns.start])
-        n_tiles = [
-            -(-(part.stop - part.start) // t) for part, t in zip((rows, columns), self.tile, strict=True)
-        ]
-        whole = len(lights) == span.stop - span.start and len(tiles) == n_tiles[0] * n_tiles[1]
+        """Write tiles of lights, file by file; what a file has beside them is kept."""
+        n_lights, *grid = shards.grid
+        for part in np.unique(lights // n_lights):
+            mine = np.flatnonzero(lights // n_lights == part)
+            some = array if len(mine) == len(lights) else array[mine]
+            for row, column in np.unique(places // grid, axis=0).tolist():
+                corner = np.array([row * grid[0], column * grid[1]])
+                inside = places[(places // grid == (row, column)).all(1)] - corner
+                start = [o - k * t for o, k, t in zip(origin, corner.tolist(), self.tile, strict=True)]
+                arguments = (lights[mine] % n_lights, inside, some, (start[0], start[1]))
+                self._guard(field, partial(shards.write, view, (int(part), row, column), *arguments))
 
-        def given(texel_rows: slice, texel_columns: slice) -> np.ndarray:
-            part = array[
-                :,
-                texel_rows.start - origin[0] : texel_rows.stop - origin[0],
-                texel_columns.start - origin[1] : texel_columns.stop - origin[1],
-            ]
-            with np.errstate(over="ignore"):
-                stored = np.ascontiguousarray(part, dtype=target.dtype)
-            check_finite(stored, self.path, field)
-            return stored
+    def _mark(self, view: int, lights: np.ndarray, places: np.ndarray) -> None:
+        """Note what is there of a view; a view that is written whole is marked without a look at its marks."""
+        shape = (1, *self._coverage.shape[1:])
+        there = self._marks(view) if len(lights) * len(places) < np.prod(shape) else None
+        marks = np.zeros(shape, np.uint8) if there is None else there.copy()
+        for row, column in places:
+            marks[0, lights, row, column] = 1
+        write_chunk(self._marks_file(view), marks)
 
-        if whole:
-            block = given(rows, columns)
-        else:
-            # What is not there is NaN.
-            block = self._guard(field, lambda: target[place])
-            for tile in tiles:
-                texels = [
-                    slice(k * t, min((k + 1) * t, n))
-                    for k, t, n in zip(tile, self.tile, self.texels, strict=True)
-                ]
-                there = [
-                    slice(part.start - first, part.stop - first)
-                    for part, first in zip(texels, within, strict=True)
-                ]
-                block[lights - span.start, there[0], there[1]] = given(*texels)
-        self._guard(field, lambda: target.__setitem__(place, block))
+    def _marks_file(self, view: int) -> Path:
+        return self.path.joinpath("coverage", "c", str(view), "0", "0", "0")
+
+    def _marks(self, view: int) -> np.ndarray | None:
+        """What the file of a view's coverage holds; None where nothing was written."""
+        return read_chunk(self._marks_file(view), np.dtype(np.uint8), (1, *self._coverage.shape[1:]))
 
     def read(
         self,
@@ -431,8 +445,16 @@ class BTFStore:
         return values, None if wanted is None else self._read("variance", wanted, selection)
 
     def _read(self, field: str, array: StoredArray, selection: Sequence[slice | np.ndarray]) -> np.ndarray:
+        texels = zip(selection[1:], array.shape[1:], strict=False)
+        whole = all(isinstance(part, slice) and part.indices(n) == (0, n, 1) for part, n in texels)
         selection = (*selection, slice(None))
-        if all(isinstance(part, slice) for part in selection):
+        if self._local and whole:
+            # Whole files at once: Zarr spends a call or more on each chunk.
+            views = np.arange(len(self.views))[selection[0]]
+            values = np.zeros((len(views), *array.shape[1:]), self._shards[field].dtype)
+            for place, view in zip(values, views.tolist(), strict=True):
+                self._guard(field, partial(self._shards[field].read, view, place))
+        elif all(isinstance(part, slice) for part in selection):
             values = self._guard(field, lambda: array[selection])
         else:
             values = self._guard(field, lambda: array.oindex[selection])

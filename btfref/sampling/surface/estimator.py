@@ -58,7 +58,7 @@ PILOT_RAYS = 3_000_000
 BACK_DIRECTIONS = 8
 
 #: Memory (bytes) of the results of views that are gathered together.
-GATHER_BUFFER = 96 << 20
+GATHER_BUFFER = 64 << 20
 
 # Streams of random numbers.
 _POINTS, _RAYS, _BROAD, _REST, _PLACES = range(5)
@@ -378,6 +378,7 @@ class SurfaceEstimator:
         each = self.n_texels * max(len(self.lit), 1) * 12
         together = max(1, min(GATHER_BUFFER // each, (2**31 - 1) * 2 // each))
         live = [view for view in views if view in self.row and len(self.lit)]
+        together = -(-len(live) // max(1, -(-len(live) // together)))  # none is left alone at the end
         held: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
         done = 0
         for view in views:

@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from btfref.sampling.surface.walks import Surface
     from btfref.types import JitArray
 
-#: Lights that one lane serves.
-LIGHTS_PER_LANE = 3
-
 #: Bound of the correction n / (n − 1) of the variance for n entries, n counted by weight.
 LEAST_FREEDOM = 4
 
@@ -78,15 +75,17 @@ def gather(
 
     n_texels, n_lit = texels[0] * texels[1], scene.lights.count
     shape = (len(rows), n_lit, n_texels, 3)
-    n_blocks = -(-n_lit // LIGHTS_PER_LANE)
+    n_blocks, n_slots = scene.lights.division()
     halves = np.stack([some.totals for some in bins])  # view, half, texel
     share = to_device(mi.Float, 0.5 + 0.5 * (halves[:, 0] - halves[:, 1]))
 
     lane = dr.arange(mi.UInt32, len(rows) * n_texels * n_blocks)
     order = to_device(mi.UInt32, _order(bins))
-    cell, first = dr.gather(mi.UInt32, order, lane // n_blocks), (lane % n_blocks) * LIGHTS_PER_LANE
+    blocks = dr.opaque(mi.UInt32, n_blocks)
+    cell, first = dr.gather(mi.UInt32, order, lane // blocks), lane % blocks
     view, texel = cell // n_texels, cell % n_texels
-    points, spread = _points(scene, surface, table, rows, bins, cell, first, variance)
+    lights = [first + j * blocks for j in range(n_slots)]
+    points, spread = _points(scene, surface, table, rows, bins, cell, lights, variance)
     drafts = [dr.empty(mi.Float, int(np.prod(shape))) for _ in range(1 + variance)]
     mine = dr.gather(mi.Float, share, cell)
     pooled = None
@@ -96,8 +95,7 @@ def gather(
         block += view * (((texels[0] + 1) // 2) * ((texels[1] + 1) // 2))
 
     def write() -> None:
-        for j in range(LIGHTS_PER_LANE):
-            light = first + j
+        for j, light in enumerate(lights):
             inside = light < n_lit
             results = [points[j]] if spread is None else [points[j], spread[j]]
             if radiance is not None:
@@ -214,14 +212,17 @@ def _points(
     rows: Sequence[int],
     bins: list[Bins],
     cell: JitArray,
-    first: JitArray,
+    index: list[JitArray],
     variance: bool,
 ) -> tuple[list[JitArray], list[JitArray] | None]:
-    """Mean and its variance from the entries: per light of a lane's block one colour each."""
+    """Mean and its variance from the entries: per light of a lane one colour each.
+
+    ``index`` are numbers of the lanes' lights, which may be beyond the last.
+    """
     import drjit as dr
     import mitsuba as mi
 
-    lights, lobes, block = scene.lights, scene.lobes, LIGHTS_PER_LANE
+    lights, lobes, block = scene.lights, scene.lobes, len(index)
     n_lit = lights.count
     start = starts(bins)
     n_entries, start = int(start[-1]), to_device(mi.UInt32, start)
@@ -231,7 +232,7 @@ def _points(
     if n_entries == 0:
         return [mi.Color3f(zero) for _ in range(block)], [mi.Color3f(zero) for _ in range(block)]
     packets = _packets(scene, surface, rows, bins)
-    index = [dr.minimum(first + j, n_lit - 1) for j in range(block)]
+    inside, index = [i < n_lit for i in index], [dr.minimum(i, n_lit - 1) for i in index]
     vectors = [dr.gather(mi.Vector3f, lights.vectors, i) for i in index]
     light_count = dr.opaque(mi.UInt32, n_lit)
     # Direct light by way of broad lobes is in the table where they are the table's.
@@ -252,7 +253,7 @@ def _points(
         for j in range(block):
             row = dr.gather(mi.Array4f, table, dr.fma(record, light_count, index[j]))
             # Zero where the light is hidden.
-            direct = bsdf.eval(context, si, si.to_local(vectors[j]), row.w != 0)
+            direct = bsdf.eval(context, si, si.to_local(vectors[j]), (row.w != 0) & inside[j])
             values.append(dr.fma(mi.Color3f(row.x, row.y, row.z), shape, direct * row.w))
         return part, weight, record, values
 

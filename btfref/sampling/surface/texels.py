@@ -275,16 +275,16 @@ class TexelWalks:
         offset, at = to_device(mi.UInt32, slot * (3 * lights.count)), to_device(mi.UInt32, index)
         share, n, coded = dr.opaque(mi.Float, 1 / self.per_half), dr.opaque(mi.UInt32, cache.n), hits["coded"]
 
-        def bring(i: JitArray) -> Callable[[JitArray, JitArray], JitArray]:
+        def bring(i: JitArray) -> Callable[[JitArray, JitArray, JitArray], JitArray]:
             i = dr.gather(mi.UInt32, at, i)
             si, bsdf, number, albedo = hits["surface"].interaction(i)
             e = unpacked(self.what, i, 12)
             si.wi, gain = si.to_local(mi.Vector3f(e[4:7])), share * mi.Color3f(e[8:11])
             facing, density = e[3], e[7]
 
-            def from_light(w: JitArray, k: JitArray) -> JitArray:
+            def from_light(w: JitArray, k: JitArray, wanted: JitArray) -> JitArray:
                 seen = cache.value(dr.gather(mi.UInt8, coded, dr.fma(i, n, k)))
-                local, lit = si.to_local(w), seen != 0
+                local, lit = si.to_local(w), (seen != 0) & wanted
                 value = lobes.eval_rest(bsdf, number, albedo, si, local, lit)
                 back = type(si)(si)
                 back.wi = local

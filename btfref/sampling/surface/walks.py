@@ -19,14 +19,15 @@ if TYPE_CHECKING:
     from btfref.sampling.surface.points import Points
     from btfref.sampling.tiled_scene import TiledScene
 
-#: Lights that one lane serves where vertices are connected to them.
-LIGHTS_PER_LANE = 3
+#: Lights that one lane serves, and multiple of the number of lanes of a vertex or a texel: whole SIMD packets then
+#: share what is looked up for all lights, and what one of their lanes need not evaluate none does.
+LIGHTS_PER_LANE, PACKET = 6, 8
 
 _FIELDS = ("p", "n", "s", "shading", "uv", "number", "albedo")
 
 
 #: What vertices bring: of the numbers of some, a function of a light and the number of its direction.
-Bring: TypeAlias = Callable[[JitArray], Callable[[JitArray, JitArray], JitArray]]
+Bring: TypeAlias = Callable[[JitArray], Callable[[JitArray, JitArray, JitArray], JitArray]]
 
 
 @dataclass
@@ -231,6 +232,13 @@ class Lights:
 
         return dr.width(self.rows)
 
+    def division(self) -> tuple[int, int]:
+        """Lanes that share the lights, and lights of each, as many lanes apart: neighbours read neighbours."""
+        lanes = -(-self.count // LIGHTS_PER_LANE)
+        if lanes > PACKET // 2:
+            lanes = -(-lanes // PACKET) * PACKET
+        return lanes, -(-self.count // lanes)
+
 
 def connect(lights: Lights, target: JitArray, offset: JitArray, bring: Bring, *, stride: int) -> None:
     """Add what vertices get from all lights to ``target``, in the order of the vertices.
@@ -242,8 +250,9 @@ def connect(lights: Lights, target: JitArray, offset: JitArray, bring: Bring, *,
     offset : mitsuba.UInt32
         Where in ``target`` the first light of each vertex goes; each ``stride`` further. Vertices may share places.
     bring : callable
-        ``bring(i)`` for the numbers of some vertices gives a callable of a light, ``(w, row) -> mitsuba.Color3f``:
-        weight · BSDF · cosine · visibility; row is the number of the light's direction.
+        ``bring(i)`` for the numbers of some vertices gives a callable of a light, ``(w, row, wanted) ->
+        mitsuba.Color3f``: weight · BSDF · cosine · visibility; row is the number of the light's direction, and what is
+        not wanted need not be evaluated.
     """
     import drjit as dr
     import mitsuba as mi
@@ -256,18 +265,21 @@ def connect(lights: Lights, target: JitArray, offset: JitArray, bring: Bring, *,
     first = np.flatnonzero(np.concatenate([[True], places[1:] != places[:-1]]))
     start = to_device(mi.UInt32, np.append(first, len(places)))
     order, places = to_device(mi.UInt32, order), to_device(mi.UInt32, places[first])
-    n_blocks, count = -(-lights.count // LIGHTS_PER_LANE), dr.opaque(mi.UInt32, lights.count)
+    (n_blocks, n_slots), count = lights.division(), dr.opaque(mi.UInt32, lights.count)
     lane = dr.arange(mi.UInt32, len(first) * n_blocks)
     blocks = dr.opaque(mi.UInt32, n_blocks)
-    place, light = lane // blocks, (lane % blocks) * LIGHTS_PER_LANE
-    chosen = [dr.minimum(light + j, count - 1) for j in range(LIGHTS_PER_LANE)]
+    place, light = lane // blocks, [lane % blocks + j * blocks for j in range(n_slots)]
+    chosen = [dr.minimum(k, count - 1) for k in light]
     vectors = [dr.gather(mi.Vector3f, lights.vectors, k) for k in chosen]
     rows = [dr.gather(mi.UInt32, lights.rows, k) for k in chosen]
+    wanted = [k < count for k in light]
     begin, end = dr.gather(mi.UInt32, start, place), dr.gather(mi.UInt32, start, place + 1)
 
     def step(i: JitArray, sums: tuple[JitArray, ...]) -> tuple[JitArray, tuple[JitArray, ...]]:
         from_light = bring(dr.gather(mi.UInt32, order, i))
-        return i + 1, tuple(a + from_light(*light) for a, *light in zip(sums, vectors, rows, strict=True))
+        return i + 1, tuple(
+            a + from_light(*light) for a, *light in zip(sums, vectors, rows, wanted, strict=True)
+        )
 
     zero = dr.zeros(mi.Float, dr.width(lane))
     state = (begin, tuple(mi.Color3f(zero) for _ in chosen))
@@ -276,13 +288,12 @@ def connect(lights: Lights, target: JitArray, offset: JitArray, bring: Bring, *,
 
     def write() -> None:
         for j, value in enumerate(sums):
-            inside = light + j < count
             for channel in range(3):
                 dr.scatter_add(
                     target,
                     value[channel],
-                    dr.fma(light + j, stride, at) + channel,
-                    inside,
+                    dr.fma(light[j], stride, at) + channel,
+                    wanted[j],
                     mode=dr.ReduceMode.NoConflicts,
                 )
 
@@ -382,17 +393,17 @@ def _bringing(
     surface, what, coded = vertices
     n = dr.opaque(mi.UInt32, cache.n)
 
-    def bring(i: JitArray) -> Callable[[JitArray, JitArray], JitArray]:
+    def bring(i: JitArray) -> Callable[[JitArray, JitArray, JitArray], JitArray]:
         si, bsdf, number, albedo = surface.interaction(i)
         e = unpacked(what, i, 8)
         si.wi, gain = mi.Vector3f(e[:3]), mi.Color3f(e[4:7])
 
-        def from_light(w: JitArray, row: JitArray) -> JitArray:
+        def from_light(w: JitArray, row: JitArray, wanted: JitArray) -> JitArray:
             seen = cache.value(dr.gather(mi.UInt8, coded, dr.fma(i, n, row)))
             local = si.to_local(w)
             if broad:
                 return gain * lobes.value(number, albedo, si.wi, local) * seen
-            return gain * bsdf.eval(lobes.full, si, local, seen != 0) * seen
+            return gain * bsdf.eval(lobes.full, si, local, (seen != 0) & wanted) * seen
 
         return from_light
 

@@ -80,6 +80,7 @@ def _result():
         "reference": {"checker": _means(rng, 16).tolist()},
         "peak_bytes": {"checker": dict.fromkeys(labels, 2**30)},
         "kernel_s": {"checker": {f"naive {n}": [0.8 * s for s in raw[f"naive {n}"]] for n in synth.SAMPLES}},
+        "floor_s": {"checker": {"surface 10": [2.0, 2.0, 2.0], "surface 28": [4.0, 4.0, 8.0]}},
         "growth": [
             synth.BASE | {"varied": "texels", "seconds": 3.0, "peak_bytes": 2**31, "n_directions": 81}
         ],
@@ -95,6 +96,8 @@ def test_ratios_are_those_of_the_class_of_equal_error():
     assert rows["surface 28"]["naive"] == pytest.approx([25.0] * 3)
     assert rows["path 64"]["naive"] == pytest.approx([5.0] * 3)
     assert rows["naive 64"]["naive"] == pytest.approx([1.0] * 3)
+    assert rows["surface 10"]["floor"] == pytest.approx([2.5, 2.0, 2.75])
+    assert rows["naive 64"]["floor"] == pytest.approx([90.0, 60.0, 100.0])
     assert rows["surface 10"]["equal_error"]
     assert not rows["surface 28"]["equal_error"]
 
@@ -103,6 +106,7 @@ def test_the_table_has_a_row_for_each_method_and_setting():
     header, rows = synth.table(_result())
     assert all(len(row) == len(header) for row in rows)
     assert rows[4][header.index("naive / it")] == "21.8 (20 … 22.5)"
+    assert rows[4][header.index("it / floor")] == "2.5 (2 … 2.75)"
     assert rows[4][header.index("MiB")] == "1024"
     assert rows[-1][:3] == ["checker", "surface 10, 64², 81², depth 8", "3.0"]
 
@@ -150,3 +154,21 @@ def test_the_growth_is_drawn_and_a_plot_without_it_refused(need, tmp_path, capsy
     assert main(arguments) == 2
     assert "growth" in capsys.readouterr().err
     assert not (tmp_path / "other.png").exists()
+
+
+def test_the_floor_counts_what_is_summed_up(llvm):
+    """Every value that the direct light of a flat tile is made of; its time grows with their number."""
+    from btfref.bench import floor
+    from btfref.mesostructure import build
+    from btfref.numerics.sphere.directions import directions
+    from btfref.sampling.surface.estimator import SurfaceEstimator
+
+    vectors = directions("1x3").vectors
+    made = SurfaceEstimator(
+        build("flat"), vectors, views=vectors, texels=(4, 4), spp=64, seed=0, max_depth=2, variance=False
+    )
+    count, seen = floor.values_of(made)
+    assert count == 3 * 3 * len(made.points.p)  # nothing of a plane is hidden
+    assert set(seen) == set(made.scene.lobes.ids)
+    one = floor.seconds(count, seen, vectors, lanes=64)
+    assert one > 0

@@ -72,10 +72,10 @@ def test_keywords_are_settings_or_the_mesostructures():
 @pytest.mark.parametrize(
     ("settings", "parameters"),
     [
-        ({}, {}),
+        ({"estimator": "path"}, {}),
         ({"variance": False}, {"variance": False}),
         (
-            {"target_error": 0.02, "spp": 4096},
+            {"target_error": 0.02, "spp": 4096, "estimator": "path"},
             {"spp": 4096, "target_error": 0.02, "texel_error": None, "pilot": 8},
         ),
         (
@@ -96,7 +96,7 @@ def test_stores_say_what_they_always_said(settings, parameters):
     }
     assert SynthesisSettings(**settings).attributes() == {
         "seed": 0,
-        "estimator": settings.get("estimator", "path"),
+        "estimator": settings.get("estimator", "auto"),
         "parameters": said | parameters,
     }
 

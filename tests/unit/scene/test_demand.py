@@ -173,7 +173,15 @@ def test_pictures_are_equal_bit_by_bit(need, fits, one_light):
 
 @pytest.fixture(scope="module")
 def settings():
-    return {"texels": 8, "views": "ubo81", "lights": "ubo81", "spp": 2, "seed": 3, "max_depth": 3}
+    return {
+        "texels": 8,
+        "views": "ubo81",
+        "lights": "ubo81",
+        "spp": 2,
+        "seed": 3,
+        "max_depth": 3,
+        "estimator": "path",
+    }
 
 
 @pytest.fixture(scope="module")
@@ -312,7 +320,7 @@ def test_parts_of_pairs(llvm, tmp_path):
 
 
 def test_missing_tiles_are_no_numbers(llvm, load_plugin, tmp_path):
-    settings = {"texels": (8, 70), "views": "10x5", "lights": [[0, 0, 1]], "spp": 2}
+    settings = {"texels": (8, 70), "views": "10x5", "lights": [[0, 0, 1]], "spp": 2, "estimator": "path"}
     part = Selection(views=tuple(range(15)), tiles=(1,))
     store = synthesize_store(tmp_path / "part.btf.zarr", "checker", only=part, **settings)
     made = raw.fit_partial(store)

@@ -1,0 +1,238 @@
+"""Files of values as bytes, written in one pass: Zarr v3 shards of the one kind that `layout` lays out.
+
+A shard is its inner chunks one after the other, each with its checksum, then where each begins and how long it is, with
+a checksum of that. Zarr reads and writes them too, but spends a Python call or more on each chunk; a view has one for
+each light.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from btfref.sampling.store.layout import DRAFT
+
+#: Bytes of a checksum, CRC-32C.
+_SUM = 4
+
+#: Offset and length of a chunk that is not there.
+_ABSENT = np.uint64(2**64 - 1)
+
+
+def checksum(data: np.ndarray) -> bytes:
+    """CRC-32C as Zarr's codec writes it: little-endian."""
+    import google_crc32c
+
+    return struct.pack("<I", google_crc32c.value(data))
+
+
+def write_bytes(path: Path, *parts: np.ndarray | bytes) -> None:
+    """A file of some parts, written under a temporary name first.
+
+    Parameters
+    ----------
+    path : Path
+        Its folder is made where it is missing.
+    *parts : ndarray or bytes
+    """
+    draft = path.with_name(path.name + DRAFT)
+    try:
+        file = open(draft, "wb", buffering=0)
+    except FileNotFoundError:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = open(draft, "wb", buffering=0)
+    try:
+        with file:
+            for part in parts:
+                rest = (part.data if isinstance(part, np.ndarray) else memoryview(part)).cast("B")
+                while len(rest):  # a system may take less than it is given
+                    rest = rest[file.write(rest) :]
+        os.replace(draft, path)
+    except BaseException:
+        draft.unlink(missing_ok=True)
+        raise
+
+
+def read_chunk(path: Path, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray | None:
+    """A chunk that is a file of its own, such as the coverage of a view; None where there is none.
+
+    Raises
+    ------
+    ValueError
+        A length or checksum that is wrong.
+    """
+    try:
+        data = np.fromfile(path, np.uint8)
+    except FileNotFoundError:
+        return None
+    size = dtype.itemsize * int(np.prod(shape))
+    if len(data) != size + _SUM or checksum(data[:size]) != data[size:].tobytes():
+        raise ValueError(f"length or checksum of {path.name}")
+    return data[:size].view(dtype).reshape(shape)
+
+
+def write_chunk(path: Path, values: np.ndarray) -> None:
+    """A chunk that is a file of its own; see `read_chunk`."""
+    data = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
+    write_bytes(path, data, checksum(data))
+
+
+@dataclass
+class Shards:
+    """Files of one array (view, light, row, column, 3), a shard each.
+
+    Attributes
+    ----------
+    folder : Path
+        Of the array.
+    dtype : numpy.dtype
+    tile : (int, int)
+        Rows and columns of an inner chunk.
+    grid : (int, int, int)
+        Lights, tile rows and tile columns of a shard.
+    """
+
+    folder: Path
+    dtype: np.dtype
+    tile: tuple[int, int]
+    grid: tuple[int, int, int]
+
+    def __post_init__(self) -> None:
+        # New memory costs as much as filling it: one buffer serves all files.
+        self._buffer = np.zeros(0, np.uint8)
+
+    @property
+    def _chunk(self) -> int:
+        """Bytes of a chunk's values."""
+        return self.dtype.itemsize * 3 * self.tile[0] * self.tile[1]
+
+    def path(self, view: int, shard: tuple[int, int, int]) -> Path:
+        """Name of a shard: that of its lights, rows and columns."""
+        return self.folder.joinpath("c", str(view), *map(str, shard), "0")
+
+    def write(
+        self,
+        view: int,
+        shard: tuple[int, int, int],
+        lights: np.ndarray,
+        tiles: np.ndarray,
+        values: np.ndarray,
+        origin: tuple[int, int],
+    ) -> None:
+        """Write chunks of one shard; others that its file has are kept as they are.
+
+        Parameters
+        ----------
+        view : int
+        shard : (int, int, int)
+        lights : ndarray of int
+            Inside the shard, ascending.
+        tiles : ndarray (k, 2) of int
+            Rows and columns of tiles inside the shard, row by row.
+        values : ndarray (lights, rows, columns, 3)
+            Rounded to the stored type, which must hold them.
+        origin : (int, int)
+            Row and column inside the shard of the first texel of ``values``, or before it where negative.
+
+        Raises
+        ------
+        ValueError
+            A file that is there and is no shard.
+        """
+        path, count, size = self.path(view, shard), int(np.prod(self.grid)), self._chunk + _SUM
+        number = (lights[:, None] * self.grid[1] + tiles[:, 0]) * self.grid[2] + tiles[:, 1]
+        kept: dict[int, np.ndarray] = {}
+        if number.size < count:
+            kept = self._chunks(path)
+            for key in number.flat:
+                kept.pop(int(key), None)
+        order = np.sort(np.concatenate([number.ravel(), np.fromiter(kept, np.int64, len(kept))]))
+        if self._buffer.size < len(order) * size:
+            self._buffer = np.zeros(len(order) * size, np.uint8)
+        data = self._buffer[: len(order) * size].reshape(-1, size)
+        place = np.searchsorted(order, number)
+        for key, chunk in kept.items():
+            data[np.searchsorted(order, key)] = chunk
+        inner = np.ndarray(
+            (len(data), *self.tile, 3), self.dtype, data,
+            strides=(size, *np.cumprod([self.dtype.itemsize, 3, self.tile[1]])[::-1].tolist()),
+        )  # fmt: skip
+        for tile, rows in zip(tiles.tolist(), place.T, strict=True):
+            first = [k * t - o for k, t, o in zip(tile, self.tile, origin, strict=True)]
+            part = values[:, first[0] : first[0] + self.tile[0], first[1] : first[1] + self.tile[1]]
+            # A slice copies nothing.
+            some = slice(rows[0], rows[-1] + 1) if rows[-1] - rows[0] == len(rows) - 1 else rows
+            if part.shape[1:3] != self.tile:
+                inner[some] = np.nan
+            inner[some, : part.shape[1], : part.shape[2]] = part
+        for row in place.ravel():
+            data[row, -_SUM:] = np.frombuffer(checksum(data[row, :-_SUM]), np.uint8)
+        index = np.full((count, 2), _ABSENT, np.uint64)
+        index[order] = np.stack([np.arange(len(order)) * size, np.full(len(order), size)], 1)
+        where = index.reshape(-1).view(np.uint8)
+        write_bytes(path, data, where, checksum(where))
+
+    def read(self, view: int, values: np.ndarray) -> None:
+        """Read a whole view into an array (lights, rows, columns, 3).
+
+        Raises
+        ------
+        ValueError
+            A file that is missing, incomplete or damaged.
+        """
+        sides = [k * t for k, t in zip(self.grid, (1, *self.tile), strict=True)]
+        for shard in np.ndindex(*(-(-n // side) for n, side in zip(values.shape, sides, strict=False))):
+            first = [k * side for k, side in zip(shard, sides, strict=True)]
+            part = values[tuple(slice(a, a + side) for a, side in zip(first, sides, strict=True))]
+            path = self.path(view, (shard[0], shard[1], shard[2]))
+            try:
+                data = np.fromfile(path, np.uint8)
+            except FileNotFoundError:
+                raise ValueError(f"no file {path.relative_to(self.folder)}") from None
+            index = self.index(data, path).reshape(*self.grid, 2)
+            for light, row, column in np.ndindex(len(part), *(-(-n // t) for n, t in zip(
+                    part.shape[1:3], self.tile, strict=True))):  # fmt: skip
+                start, size = index[light, row, column].tolist()
+                if start == _ABSENT:
+                    raise ValueError(f"a chunk of {path.relative_to(self.folder)} is missing")
+                chunk = data[start : start + size - _SUM]
+                if checksum(chunk) != data[start + size - _SUM : start + size].tobytes():
+                    raise ValueError(f"checksum of a chunk of {path.relative_to(self.folder)}")
+                place = part[
+                    light,
+                    row * self.tile[0] : (row + 1) * self.tile[0],
+                    column * self.tile[1] : (column + 1) * self.tile[1],
+                ]
+                tile = chunk.view(self.dtype).reshape(*self.tile, 3)
+                place[...] = tile[: place.shape[0], : place.shape[1]]
+
+    def _chunks(self, path: Path) -> dict[int, np.ndarray]:
+        """Chunks of a file, with their checksums, by their numbers."""
+        try:
+            data = np.fromfile(path, np.uint8)
+        except FileNotFoundError:
+            return {}
+        index = self.index(data, path)
+        there = np.flatnonzero(index[:, 0] != _ABSENT)
+        return {int(key): data[index[key, 0] : index[key].sum()] for key in there}
+
+    def index(self, data: np.ndarray, path: Path) -> np.ndarray:
+        """Offset and length of all chunks of a file's bytes, checked: (chunks, 2) uint64.
+
+        Raises
+        ------
+        ValueError
+        """
+        count, size = int(np.prod(self.grid)), self._chunk + _SUM
+        where, told = data[-16 * count - _SUM : -_SUM], data[-_SUM:].tobytes()
+        if len(where) != 16 * count or checksum(where) != told:
+            raise ValueError(f"checksum of {path.name}")
+        index = where.copy().view(np.uint64).reshape(-1, 2)
+        there = index[index[:, 0] != _ABSENT]
+        if (there[:, 1] != size).any() or (there[:, 0] + size > len(data) - 16 * count - _SUM).any():
+            raise ValueError(f"index of {path.name}")
+        return index
