@@ -21,13 +21,12 @@ from argparse import ArgumentParser, Namespace
 
 from btfref.commands.demand import add_scene_arguments, union, whole_shape
 from btfref.commands.shared.options import add_dtype, add_json, add_memory, add_seed
+from btfref.commands.shared.own_geometry import add_own_geometry, own_parameters
 from btfref.commands.shared.printing import Progress, bytes_text, emit, emit_json, printable
 from btfref.commands.shared.reading import (
-    assignments,
     count,
     direction_set,
     number_above,
-    numbers_or_file,
     output_file,
     ranges,
 )
@@ -35,9 +34,6 @@ from btfref.errors import SAMPLES as MANY_SAMPLES
 from btfref.errors import WORKERS, InputError
 from btfref.sampling.settings import ESTIMATORS, MOST_SAMPLES, SAMPLES, SynthesisSettings
 from btfref.types import Facts
-
-#: Options that are parameters of a user's mesh or height map.
-_OWN = ("bsdf", "albedo", "roughness", "amplitude", "tile", "up", "allow_seams")
 
 #: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
 OUTPUTS = {"output": "store"}
@@ -94,9 +90,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     add_seed(parser)
     add_dtype(parser)
-    parser.add_argument(
-        "--set", nargs="+", action="extend", metavar="KEY=VALUE", help="parameters of the mesostructure"
-    )
+    add_own_geometry(parser)
     parser.add_argument(
         "--estimator",
         choices=tuple(ESTIMATORS),
@@ -108,27 +102,6 @@ def add_arguments(parser: ArgumentParser) -> None:
         action="store_true",
         help="leave the variance out: half the bytes, faster with surface",
     )
-    own = parser.add_argument_group("a mesh or a height map of your own")
-    own.add_argument("--bsdf", metavar="FILE.xml", help="a Mitsuba BSDF, with its textures")
-    own.add_argument(
-        "--albedo", type=numbers_or_file, metavar="IMAGE|R,G,B", help="of a height map (default 0.5,0.5,0.5)"
-    )
-    own.add_argument(
-        "--roughness", type=numbers_or_file, metavar="IMAGE|X", help="of a height map (default: Lambertian)"
-    )
-    own.add_argument(
-        "--amplitude", type=float, metavar="A", help="tile units that a height of 1 stands for (default 0.1)"
-    )
-    own.add_argument(
-        "--tile",
-        type=numbers_or_file,
-        metavar="X0,Y0,X1,Y1",
-        help="where one tile lies in the mesh, in its units, or: bounds (default 0,0,1,1)",
-    )
-    own.add_argument(
-        "--up", choices=("y", "z"), help="axis of the mesh that points up (default: glTF y, else z)"
-    )
-    own.add_argument("--allow-seams", action="store_true", default=None, help="take input that does not tile")
     for name in ("views", "lights", "tiles"):
         parser.add_argument(
             f"--only-{name}", type=ranges, metavar="I,J-K", help=f"fill these {name} now, the rest later"
@@ -168,14 +141,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(args: Namespace) -> int:
     """Carry the command out."""
     out = output_file(args.output, ".btf.zarr")
-    parameters = assignments(args.set)
-    for name in _OWN:
-        if getattr(args, name) is not None:
-            parameters[name] = getattr(args, name)
-    for key in parameters:
-        if key in SynthesisSettings.names():
-            option = f"--{key.replace('_', '-')}"
-            raise InputError("not a parameter of the mesostructure", field="--set", got=key, expected=option)
+    parameters = own_parameters(args, SynthesisSettings.names())
 
     from btfref.sampling.store.selection import Selection
     from btfref.sampling.synthesis import make_job
