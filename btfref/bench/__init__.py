@@ -15,8 +15,10 @@ SUITES = {
     "gbrdf": "btfref.bench.experiments.gbrdf",
     "lobes": "btfref.bench.experiments.lobes",
     "lod": "btfref.bench.experiments.lod",
+    "offgrid": "btfref.bench.experiments.offgrid",
     "proposals": "btfref.bench.experiments.proposals",
     "pyramid": "btfref.bench.experiments.pyramid",
+    "queries": "btfref.bench.experiments.queries",
     "reflectance": "btfref.bench.experiments.reflectance",
     "synth": "btfref.bench.synth",
 }

@@ -70,7 +70,7 @@ class QueryJob:
             used = ("numpy",)
         self.attributes: Facts = {
             "settings": settings.facts(),
-            "source": facts or {"kind": "representation", "method": source.meta.get("method")},  # type: ignore[union-attr]  # it is one
+            "source": facts or _representation_facts(source),  # type: ignore[arg-type]  # it is one
             "versions": versions(used),
         }
 
@@ -249,6 +249,17 @@ def fingerprint(path: PathLike) -> str:
             while block := stream.read(1 << 20):
                 state.update(block)
     return state.hexdigest()[:32]
+
+
+def _representation_facts(source: Representation) -> Facts:
+    """What a file says of a representation that has none."""
+    import hashlib
+
+    state = hashlib.sha256()
+    for name, array in sorted(source.arrays().items()):
+        state.update(f"{name} {array.dtype} {array.shape}".encode())
+        state.update(np.ascontiguousarray(array).tobytes())
+    return {"kind": "representation", "method": source.meta.get("method"), "hash": state.hexdigest()[:32]}
 
 
 def _without(source: Representation, parameters: Facts) -> Representation:

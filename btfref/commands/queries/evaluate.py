@@ -1,8 +1,8 @@
 """Write a method's answers to the rows of a file of queries, and say how far off they are.
 
-The noise of the true values is taken out of the errors; each stands with its 99 % interval. Footprints are averaged over
-random places, the same for every method (--filter lookups), looked up at the level of detail of their width (level, of
-methods that have levels), or ignored (point).
+The noise of the true values is taken out of the errors; each stands with its 99 % interval. Footprints are averaged
+over random places, the same for every method (--filter lookups), looked up at the level of detail of their width
+(level, of methods that have levels), or ignored (point).
 
   btfref query checker -o checker.queries.zarr --n 1e5 --spp 256 --max-theta 85
   btfref evaluate checker.lpca.exr checker.queries.zarr -o lpca.npy

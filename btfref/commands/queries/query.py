@@ -157,7 +157,7 @@ def run(args: Namespace) -> int:
     from btfref.querying.files import export
 
     out = output_file(args.output, *export.ENDINGS)
-    export.check(out, args.layout, args.dtype, args.picture)
+    export.check(out, args.n, args.layout, args.dtype, args.picture)
     chosen = vars(args) | {"light": direction_set(args.light), "view": direction_set(args.view)}
     settings = QuerySettings(**{name: chosen[name] for name in QuerySettings.names()})
     parameters = own_parameters(args, QuerySettings.names())

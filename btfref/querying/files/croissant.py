@@ -153,7 +153,7 @@ def _distribution(path: Path) -> list[Facts]:
             "@type": "cr:FileSet",
             "@id": path.name,
             "name": path.name,
-            "description": f"{len(files)} files, {size} bytes; SHA-256 of their names and bytes: {_sha256(files, path)}",
+            "description": f"{len(files)} files, {size} bytes; SHA-256 of names and bytes: {_sha256(files, path)}",
             "encodingFormat": "application/vnd.zarr",
             "includes": f"{path.name}/**",
         }

@@ -6,11 +6,11 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from btfref.errors import InputError
+from btfref.errors import InputError, refuse_above
 from btfref.outputs import new_file
 from btfref.querying.files.croissant import write_croissant
 from btfref.querying.files.hdf5 import LAYOUTS, TEXELS, h5py, write_product, write_records
-from btfref.querying.files.plain import write_npz, write_parquet
+from btfref.querying.files.plain import SMALL, write_npz, write_parquet
 from btfref.querying.files.zarr_file import ENDING
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ def rows_of(out: Path) -> Path:
     return out if out.name.endswith(ENDING) else out.with_name(out.name + ROWS)
 
 
-def check(out: Path, layout: str | None, dtype: str, picture: object) -> None:
+def check(out: Path, n: int, layout: str | None, dtype: str, picture: object) -> None:
     """Refuse what cannot be written before any row is made.
 
     Raises
@@ -40,6 +40,8 @@ def check(out: Path, layout: str | None, dtype: str, picture: object) -> None:
         raise InputError(
             "cannot tell the file type", file=out, expected=f"a name ending in {', '.join(ENDINGS)}"
         )
+    if out.suffix == ".npz":
+        refuse_above(SMALL, n, "--n")
     hdf5 = out.suffix in (".h5", ".hdf5")
     if (layout is not None or dtype != "float32") and not hdf5:
         raise InputError(

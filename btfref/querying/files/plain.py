@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from btfref.errors import InputError, Limit, MissingDependencyError
+from btfref.errors import Limit, MissingDependencyError
 from btfref.querying.files.zarr_file import COLUMNS
 
 if TYPE_CHECKING:
@@ -22,15 +22,7 @@ _PARTS = {"uv": "uv", "w_light": "xyz", "w_view": "xyz", "B": "rgb", "variance":
 
 
 def write_npz(queries: QueryFile, out: Path) -> None:
-    """Write all columns, and the attributes as JSON text.
-
-    Raises
-    ------
-    InputError
-        Too many rows.
-    """
-    if queries.n > SMALL.most:
-        raise InputError("too many rows for a .npz", field="n", got=queries.n, expected=SMALL)
+    """Write all columns, and the attributes as JSON text."""
     np.savez(out, **queries.read(), attributes=np.array(json.dumps(queries.attributes)))
 
 

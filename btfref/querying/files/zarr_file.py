@@ -244,7 +244,7 @@ def attributes_of(path: PathLike) -> Facts:
 
 
 def begin(
-    path: PathLike, n: int, attributes: Facts, *, overwrite: bool = False, chunk: int = CHUNK
+    path: PathLike, n: int, attributes: Facts, *, overwrite: bool = False, chunk: int | None = None
 ) -> QueryFile:
     """The store at a path for some attributes: the one that an earlier run began, or an empty one.
 
@@ -257,8 +257,8 @@ def begin(
         JSON types: what the rows depend on.
     overwrite : bool
         Replace a store of other attributes.
-    chunk : int
-        Rows of a chunk.
+    chunk : int, optional
+        Rows of a chunk; by default `CHUNK`.
 
     Raises
     ------
@@ -290,7 +290,7 @@ def begin(
     draft = path.with_name(path.name + DRAFT)
     shutil.rmtree(draft, ignore_errors=True)
     try:
-        _lay_out(draft, n, wanted, min(chunk, n))
+        _lay_out(draft, n, wanted, min(chunk or CHUNK, n))
         os.rename(draft, path)
     except BaseException as error:
         shutil.rmtree(draft, ignore_errors=True)
