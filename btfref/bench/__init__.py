@@ -10,6 +10,7 @@ from __future__ import annotations
 SUITES = {
     "between": "btfref.bench.experiments.between",
     "demand": "btfref.bench.demand",
+    "directions": "btfref.bench.experiments.directions",
     "env": "btfref.bench.experiments.env",
     "factors": "btfref.bench.experiments.factors",
     "gbrdf": "btfref.bench.experiments.gbrdf",

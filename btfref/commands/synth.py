@@ -18,6 +18,7 @@ import functools
 import operator
 import sys
 from argparse import ArgumentParser, Namespace
+from typing import Any
 
 from btfref.commands.demand import add_scene_arguments, union, whole_shape
 from btfref.commands.shared.options import add_dtype, add_json, add_memory, add_seed
@@ -30,8 +31,8 @@ from btfref.commands.shared.reading import (
     output_file,
     ranges,
 )
+from btfref.errors import INDICES, WORKERS, InputError
 from btfref.errors import SAMPLES as MANY_SAMPLES
-from btfref.errors import WORKERS, InputError
 from btfref.sampling.settings import ESTIMATORS, MOST_SAMPLES, SAMPLES, SynthesisSettings
 from btfref.types import Facts
 
@@ -57,7 +58,8 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="texels per side (default %(default)s)",
     )
     directions = (
-        "ubo81, ubo151, a grid such as 10x5, or a .txt file of theta and phi in degrees (default %(default)s)"
+        "ubo81, ubo151, a grid such as 10x5, a .txt file of theta and phi in degrees, or adaptive:N, chosen for the "
+        "surface (default %(default)s)"
     )
     parser.add_argument("--views", default=default.views, metavar="SET", help=directions)
     parser.add_argument("--lights", default=default.lights, metavar="SET", help="likewise")
@@ -147,8 +149,7 @@ def run(args: Namespace) -> int:
     from btfref.sampling.synthesis import make_job
 
     chosen = vars(args) | {
-        "views": direction_set(args.views),
-        "lights": direction_set(args.lights),
+        **_directions(args, parameters),
         "variance": not args.no_variance,
     }
     settings = SynthesisSettings(**{name: chosen[name] for name in SynthesisSettings.names()})
@@ -186,6 +187,33 @@ def run(args: Namespace) -> int:
     if info["error"]:
         emit(error_text(info["error"]))
     return 0
+
+
+def _directions(args: Namespace, parameters: Facts) -> Facts:
+    """Views and lights: sets, files, or as many as are asked for, chosen for the surface."""
+    from btfref.sampling.chosen_directions import ADAPTIVE, chosen_directions
+
+    made: dict[str, Any] = {}
+    for text in (args.views, args.lights):
+        kind, _, number = text.partition(":")
+        if kind != ADAPTIVE:
+            made[text] = direction_set(text)
+        elif args.scenes:
+            raise InputError(
+                "a set that is chosen for the surface", field="--for", got=text, expected="another"
+            )
+        elif not number.isdecimal() or len(number) > len(str(INDICES.most)):
+            raise InputError("unknown set of directions", got=text[:40], expected=f"{ADAPTIVE}:N")
+        elif text not in made:
+            made[text] = chosen_directions(
+                args.mesostructure,
+                int(number),
+                seed=args.seed,
+                max_depth=args.max_depth,
+                variant=args.variant,
+                **parameters,
+            )
+    return {"views": made[args.views], "lights": made[args.lights]}
 
 
 def error_text(error: Facts) -> str:

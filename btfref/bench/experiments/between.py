@@ -19,6 +19,7 @@ from btfref.errors import InputError
 from btfref.registry import methods
 
 if TYPE_CHECKING:
+    from btfref.numerics.sphere.directions import DirectionSet
     from btfref.representations.protocol import Representation
     from btfref.sampling import SampledBTF
     from btfref.types import Facts
@@ -95,7 +96,7 @@ def chosen_of(axes: Sequence[Sequence[str]], options: Options) -> list[Sequence[
     return [[name for name in axis if name in (options.only or ())] or axis for axis in axes]
 
 
-def fitted_to(name: str, directions: str, options: Options) -> SampledBTF:
+def fitted_to(name: str, directions: str | DirectionSet, options: Options) -> SampledBTF:
     """What methods are fitted to: a mesostructure at a set of directions."""
     from btfref.sampling.synthesis import synthesize
 

@@ -27,7 +27,7 @@ def test_the_noise_is_taken_out(material):
         "rmse": np.sqrt(np.mean((value - true) ** 2)),
         "mae": np.abs(value - true).mean(),
         "bias": (value - true).mean() / true.mean(),
-        "psnr_log": 20 * np.log10(np.quantile(np.log1p(true), 0.999))
+        "psnr_log": 20 * np.log10(np.quantile(np.log1p(truth), 0.999))
         - 10 * np.log10(np.mean((np.log1p(value) - np.log1p(true)) ** 2)),
         "delta_e00": np.sqrt(
             np.mean(ciede2000(lab(np.clip(np.pi * value, 0, 1)), lab(np.clip(np.pi * true, 0, 1))) ** 2)

@@ -95,7 +95,7 @@ def test_random_records_are_read_without_our_code(file, whole, tmp_path, need):
     limit = tolerance("queries.rounding.z")
     assert np.abs(camera + rows["w_view"]).max() <= limit
     assert np.abs(light + rows["w_light"]).max() <= limit
-    assert np.array_equal(0.5 * (location + 1), rows["uv"])
+    assert np.abs(0.5 * (location + 1) - rows["uv"]).max() <= tolerance("queries.rounding.length")
     assert np.array_equal(radius[:, 0], rows["radius"])
     # A reader that multiplies by the cosine has B.
     assert np.abs(color * rows["w_light"][:, 2:] - rows["B"]).max() <= tolerance("queries.rounding.length")
@@ -152,16 +152,16 @@ def test_arrays_and_tables(file, whole, tmp_path, need):
 KILLED = """
 import sys
 from btfref.querying.files import zarr_file
-zarr_file.CHUNK = 64
+zarr_file.CHUNK = 256
 from btfref.cli import main
 sys.exit(main(sys.argv[1:]))
 """
 
 
 def test_a_killed_run_goes_on_to_the_same_bytes(file, tmp_path, monkeypatch):
-    monkeypatch.setattr(zarr_file, "CHUNK", 64)
+    monkeypatch.setattr(zarr_file, "CHUNK", 256)
     alone, killed = tmp_path / "alone.queries.zarr", tmp_path / "killed.queries.zarr"
-    options = ["--n", "20000", "--spp", "8", "--radius", "0.01"]
+    options = ["--n", "10000", "--spp", "16", "--radius", "0.01"]
     assert main(["query", str(file), "-o", str(alone), *options]) == 0
     child = subprocess.Popen(
         [sys.executable, "-c", KILLED, "query", str(file), "-o", str(killed), *options],
@@ -222,12 +222,12 @@ def test_levels_of_detail_answer_footprints(tmp_path):
     """Wide footprints of a method with levels: coarse ones are nearer to the average over the footprint."""
     from btfref.querying.evaluate import evaluate
 
-    values = np.random.default_rng(4).uniform(0.0, 0.3, (1, 1, 32, 32, 3))
+    values = np.random.default_rng(4).uniform(0.0, 0.3, (1, 1, 16, 16, 3))
     btf = btfref.SampledBTF(values, [[0, 0, 1.0]], [[0, 0, 1.0]])
     table = btfref.fit("raw", btf)
     pyramid = btfref.fit("laplacian", btf)
     queries = tmp_path / "rows.queries.zarr"
-    query_file(queries, table, n=300, light=[[0, 0, 1.0]], view=[[0, 0, 1.0]], radius=0.06, spp=256)
+    query_file(queries, table, n=200, light=[[0, 0, 1.0]], view=[[0, 0, 1.0]], radius=0.12, spp=64)
     found = {
         name: evaluate(pyramid, queries, tmp_path / "values.npy", filter=name)["errors"]["rmse"][0]
         for name in ("level", "point")

@@ -54,7 +54,7 @@ def test_densities_of_pairs_are_those_of_the_rows(light, view, max_theta):
 def test_a_wrong_density_is_found():
     law = laws("cosine", "uniform", "0")
     rows = law.rows(7, 0, 60_000)
-    rows["density"] = rows["density"] * np.where(rows["w_light"][:, 2] > 0.5, 1.03, 1)
+    rows["density"] = rows["density"] * np.where(rows["w_light"][:, 2] > 0.5, 1.05, 1)
     assert chi_square(rows, 0.0) < tolerance("queries.law.significance")
 
 
