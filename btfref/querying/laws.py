@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from btfref.errors import InputError
+from btfref.errors import DIRECTIONS, InputError, refuse_above
 from btfref.numerics.sphere.directions import directions, spherical
 from btfref.numerics.sphere.halfway import in_out
 
@@ -87,13 +87,13 @@ class DirectionLaw:
         ------
         InputError
         """
-        if isinstance(spec, str) and spec in POWERS:
+        if not isinstance(spec, str):
+            return cls("custom", _unit(spec, field))
+        if spec in POWERS:
             return cls(spec)
         try:
             found = directions(spec)
         except InputError as error:
-            if not isinstance(spec, str):
-                raise
             known = (
                 f"{', '.join(POWERS)}, {HALFDIFF} (of both), ubo81, ubo151, a grid such as 10x5, or a file"
             )
@@ -131,6 +131,20 @@ class DirectionLaw:
             return np.full(np.shape(z), 1 / len(self.vectors))
         power = POWERS[self.name]
         return power * z ** (power - 1) / (2 * np.pi * (1 - least_z**power))
+
+
+def _unit(spec: ArrayLike, field: str) -> np.ndarray:
+    """Unit vectors above the horizon; unlike those of a sampled BTF, they need not be interpolated between."""
+    try:
+        vectors = np.asarray(getattr(spec, "vectors", spec), float)
+    except (TypeError, ValueError):
+        vectors = np.zeros(0)
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True) if vectors.ndim == 2 else vectors
+    good = vectors.ndim == 2 and vectors.shape[1] == 3 and len(vectors) > 0 and np.isfinite(vectors).all()
+    if not good or not (length > 0).all() or not (vectors[:, 2] > 0).all():
+        raise InputError("cannot use directions", field=field, expected="vectors with z > 0, shape (n, 3)")
+    refuse_above(DIRECTIONS, len(vectors), field)
+    return vectors / length
 
 
 def sample_halfdiff(u: np.ndarray, least_z: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

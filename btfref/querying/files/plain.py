@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,7 +23,8 @@ _PARTS = {"uv": "uv", "w_light": "xyz", "w_view": "xyz", "B": "rgb", "variance":
 
 def write_npz(queries: QueryFile, out: Path) -> None:
     """Write all columns, and the attributes as JSON text."""
-    np.savez(out, **queries.read(), attributes=np.array(json.dumps(queries.attributes)))
+    arrays: dict[str, Any] = {**queries.read(), "attributes": np.array(json.dumps(queries.attributes))}
+    np.savez(out, **arrays)
 
 
 def parquet_columns() -> list[tuple[str, str, int | None]]:

@@ -25,7 +25,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -35,6 +35,7 @@ from btfref.outputs import require_folder_of
 from btfref.sampling.store.layout import DRAFT
 
 if TYPE_CHECKING:
+    from btfref.sampling.store.arrays import StoredArray
     from btfref.types import Facts, PathLike
 
 KIND = "btf-queries"
@@ -103,22 +104,18 @@ class QueryFile:
         self.attributes = attributes_of(self.path)
         try:
             group = zarr.open_group(str(self.path), mode="r+")
-            self._arrays = {name: group[name] for name in (*COLUMNS, "coverage")}
-        except (KeyError, ValueError, TypeError) as error:
+            self._arrays = {name: cast("StoredArray", group[name]) for name in (*COLUMNS, "coverage")}
+            shapes = {name: tuple(array.shape) for name, array in self._arrays.items()}
+        except (KeyError, ValueError, TypeError, AttributeError) as error:
             raise InputError("damaged queries", file=self.path, got=error) from error
         for name, (width, kind) in COLUMNS.items():
-            array = self._arrays[name]
-            if (
-                array.ndim != 1 + bool(width)
-                or str(array.dtype) != kind
-                or array.shape[1:] not in ((), (width,))
-            ):  # type: ignore[union-attr]  # whatever Zarr found
-                raise InputError(
-                    "damaged queries", file=self.path, field=name, expected=f"{kind}, {width or 1} wide"
-                )
-        self.n, self.chunk = int(self._arrays["uv"].shape[0]), int(self._arrays["uv"].chunks[0])  # type: ignore[union-attr]
-        lengths = {int(self._arrays[name].shape[0]) for name in COLUMNS}  # type: ignore[union-attr]
-        if lengths != {self.n} or self._arrays["coverage"].shape != (-(-self.n // self.chunk),):  # type: ignore[union-attr]
+            last = (width,) if width else ()
+            if str(self._arrays[name].dtype) != kind or shapes[name][1:] != last or not shapes[name]:
+                expected = f"{kind}, {width or 1} wide"
+                raise InputError("damaged queries", file=self.path, field=name, expected=expected)
+        self.n, self.chunk = shapes["uv"][0], int(self._arrays["uv"].chunks[0])
+        lengths = {shapes[name][0] for name in COLUMNS}
+        if lengths != {self.n} or shapes["coverage"] != (-(-self.n // self.chunk),):
             raise InputError("damaged queries", file=self.path, field="n", got=sorted(lengths))
 
     def __repr__(self) -> str:
@@ -130,7 +127,7 @@ class QueryFile:
     @property
     def coverage(self) -> np.ndarray:
         """Which chunks are there, bool."""
-        return np.asarray(self._arrays["coverage"][:]) == 1  # type: ignore[index]  # an array
+        return np.asarray(self._arrays["coverage"][:]) == 1
 
     @property
     def complete(self) -> bool:
@@ -172,7 +169,7 @@ class QueryFile:
                 expected="100%",
             )
         try:
-            return {name: np.asarray(self._arrays[name][first:last]) for name in columns}  # type: ignore[index]
+            return {name: np.asarray(self._arrays[name][first:last]) for name in columns}
         except (ValueError, RuntimeError) as error:  # a checksum that is wrong
             raise InputError(
                 "damaged queries", file=self.path, field=", ".join(columns), got=error
@@ -190,8 +187,8 @@ class QueryFile:
         """Store a chunk; it counts as there only when all of it is on disk."""
         first, last = self.extent(chunk)
         for name in COLUMNS:
-            self._arrays[name][first:last] = rows[name]  # type: ignore[index]
-        self._arrays["coverage"][chunk : chunk + 1] = 1  # type: ignore[index]
+            self._arrays[name][first:last] = rows[name]
+        self._arrays["coverage"][chunk : chunk + 1] = 1
 
     def facts(self) -> Facts:
         """What its headers say, JSON types."""

@@ -161,7 +161,7 @@ sys.exit(main(sys.argv[1:]))
 def test_a_killed_run_goes_on_to_the_same_bytes(file, tmp_path, monkeypatch):
     monkeypatch.setattr(zarr_file, "CHUNK", 256)
     alone, killed = tmp_path / "alone.queries.zarr", tmp_path / "killed.queries.zarr"
-    options = ["--n", "10000", "--spp", "16", "--radius", "0.01"]
+    options = ["--n", "5000", "--spp", "16", "--radius", "0.01"]
     assert main(["query", str(file), "-o", str(alone), *options]) == 0
     child = subprocess.Popen(
         [sys.executable, "-c", KILLED, "query", str(file), "-o", str(killed), *options],
