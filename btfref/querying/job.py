@@ -64,7 +64,7 @@ class QueryJob:
                 for part in source.parts:
                     load_bsdf(part)
             facts = path_facts(source)
-            used = (*VERSIONS, LLVM) if settings.variant.startswith("llvm") else VERSIONS
+            used: tuple[str, ...] = (*VERSIONS, LLVM) if settings.variant.startswith("llvm") else VERSIONS
         else:
             LookupSource(source, settings)  # which refuses what it cannot do
             used = ("numpy",)

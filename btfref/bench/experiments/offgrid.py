@@ -38,7 +38,7 @@ MAX_THETA = 85.0
 FOOTPRINTS = {"point": 0.0, "texel": 0.5, "4 x 4 texels": 2.0}
 
 #: Rows of each footprint, samples of each half of a row, and lookups that a method averages over a footprint.
-ROWS, SPP, LOOKUPS = 4000, 256, 64
+ROWS, SPP, LOOKUPS = 4000, 256, 16
 
 #: Rows where less is asked for.
 QUICK_ROWS, QUICK_SPP = 500, 64

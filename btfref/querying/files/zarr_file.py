@@ -188,7 +188,7 @@ class QueryFile:
         first, last = self.extent(chunk)
         for name in COLUMNS:
             self._arrays[name][first:last] = rows[name]
-        self._arrays["coverage"][chunk : chunk + 1] = 1
+        self._arrays["coverage"][chunk : chunk + 1] = np.ones(1, np.uint8)
 
     def facts(self) -> Facts:
         """What its headers say, JSON types."""
