@@ -24,7 +24,7 @@ TYPES = {
     ".h5": "application/x-hdf5",
     ".hdf5": "application/x-hdf5",
     ".npz": "application/x-npz",
-    ".parquet": "application/vnd.apache.parquet",
+    ".parquet": "application/x-parquet",
 }
 
 #: Terms of the format, as its specification wants them in every file.
@@ -38,6 +38,7 @@ CONTEXT: Facts = {
     "data": {"@id": "cr:data", "@type": "@json"},
     "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
     "dct": "http://purl.org/dc/terms/",
+    "equivalentProperty": "cr:equivalentProperty",
     "examples": {"@id": "cr:examples", "@type": "@json"},
     "extract": "cr:extract",
     "field": "cr:field",
@@ -52,11 +53,13 @@ CONTEXT: Facts = {
     "md5": "cr:md5",
     "parentField": "cr:parentField",
     "path": "cr:path",
+    "rai": "http://mlcommons.org/croissant/RAI/",
     "recordSet": "cr:recordSet",
     "references": "cr:references",
     "regex": "cr:regex",
     "repeated": "cr:repeated",
     "replace": "cr:replace",
+    "samplingRate": "cr:samplingRate",
     "sc": "https://schema.org/",
     "separator": "cr:separator",
     "source": "cr:source",
