@@ -21,6 +21,7 @@ from btfref.provenance import __version__
 if TYPE_CHECKING:
     from btfref.comparison import compare
     from btfref.numerics.sphere.directions import DirectionSet
+    from btfref.querying.batches import queries
     from btfref.rendering.gl.realtime import realtime
     from btfref.rendering.offline.reference import render
     from btfref.representations.protocol import Representation
@@ -35,6 +36,7 @@ __all__ = [
     "compare",
     "fit",
     "load",
+    "queries",
     "realtime",
     "render",
     "save",
@@ -46,6 +48,7 @@ _HOMES = {
     "DirectionSet": "btfref.numerics.sphere.directions",
     "SampledBTF": "btfref.sampling",
     "compare": "btfref.comparison",
+    "queries": "btfref.querying.batches",
     "realtime": "btfref.rendering.gl.realtime",
     "render": "btfref.rendering.offline.reference",
     "synthesize": "btfref.sampling.synthesis",

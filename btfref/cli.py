@@ -11,7 +11,6 @@ import contextlib
 import errno
 import importlib
 import io
-import keyword
 import os
 import signal
 import sys
@@ -20,7 +19,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
-from btfref.commands import COMMANDS
+from btfref.commands import COMMANDS, module_of
 from btfref.commands.shared.paths import check_paths
 from btfref.commands.shared.printing import printable
 from btfref.commands.shared.stdout import own_stdout
@@ -84,8 +83,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"btfref {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name in COMMANDS:
-        # A module cannot carry the name of a keyword: the command `import` is in import_.py.
-        module = importlib.import_module(f"btfref.commands.{name}{'_' * keyword.iskeyword(name)}")
+        module = importlib.import_module(module_of(name))
         # Without docstrings (python -OO) the name has to do.
         summary = (module.__doc__ or name).splitlines()[0].rstrip(".")
         command = commands.add_parser(

@@ -26,6 +26,8 @@ CAPABILITIES = {
     "sklearn": lambda: importlib.util.find_spec("sklearn"),
     "matplotlib": lambda: importlib.util.find_spec("matplotlib"),
     "distributed": lambda: importlib.util.find_spec("distributed"),
+    "h5py": lambda: importlib.util.find_spec("h5py"),
+    "pyarrow": lambda: importlib.util.find_spec("pyarrow"),
     "llvm": lambda: _llvm(),
     "gl": lambda: _gl(),
 }

@@ -8,6 +8,7 @@ import errno
 import json
 import os
 import re
+import sys
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -107,6 +108,13 @@ def locked(folder, patch):
     # Given back when the patches are.
     patch.setattr("btfref.cli.LONGEST", 2000)
     patch.held = held
+
+
+def some_rows(folder, patch):
+    """Four rows of the good representation."""
+    from btfref.querying import query_file
+
+    query_file(folder / "rows.queries.zarr", load(folder / "good.exr"), n=4)
 
 
 def no_llvm(folder, patch):
@@ -355,6 +363,48 @@ ROWS = [
     ),
     Row(
         "packages", "of another type", "fit odd good.btf.zarr -o out.exr", ("odd",), prepare=points(odd=dict)
+    ),
+    # 9
+    *(
+        Row("queries", fault, f"query {command}", words)
+        for fault, command, words in (
+            ("an unknown kind of file", "flat -o rows.csv", ("rows.csv", ".queries.zarr")),
+            ("no such law", "flat -o rows.npz --light sideways", ("light", "halfdiff")),
+            ("a law of both", "flat -o rows.npz --view halfdiff", ("both",)),
+            ("no such radius", "flat -o rows.npz --radius wide", ("radius", "levels")),
+            ("no whole number", "flat -o rows.npz --n 1.5", ("whole number",)),
+            ("more than there can be", "flat -o rows.npz --n 1e12", ("at most",)),
+            ("no whole pictures", "flat -o rows.h5 --n 10 --picture 3", ("multiple of 9",)),
+            ("pictures wanted", "flat -o rows.h5 --n 9 --layout product", ("--picture",)),
+            ("a layout of other files", "flat -o rows.npz --layout records", (".h5",)),
+            ("an unknown surface", "velvet -o rows.npz --n 4", ("velvet",)),
+            ("a parameter of a file", "good.exr -o rows.npz --n 4 --set k=1", ("no parameters",)),
+            ("a scheduler for lookups", "good.exr -o rows.npz --n 4 --scheduler dask", ("scheduler",)),
+            ("its input", "good.exr -o good.exr", ("input",)),
+            ("a store there", "flat -o good.btf.zarr --n 4", ("good.btf.zarr",)),
+        )
+    ),
+    Row(
+        "queries",
+        "no h5py",
+        "query good.exr -o rows.h5 --n 4",
+        ("h5py", "pip install"),
+        prepare=lambda folder, patch: patch.setitem(sys.modules, "h5py", None),
+    ),
+    Row("queries", "no queries", "evaluate good.exr good.btf.zarr -o values.npy", ("no queries",)),
+    Row(
+        "queries",
+        "no levels",
+        "evaluate good.exr rows.queries.zarr -o values.npy --filter level",
+        ("levels",),
+        prepare=some_rows,
+    ),
+    Row(
+        "queries",
+        "its input",
+        "evaluate good.exr rows.queries.zarr -o rows.queries.zarr/x.npy",
+        ("lies in",),
+        prepare=some_rows,
     ),
     Row("packages", "no such exporter", "export good.btf.zarr --format gone -o new", ("ubo", "utia", "bonn")),
     Row("ports", "a sampled BTF", f"{PORT.replace('.exr', '.btf.zarr')} new", ("good.btf.zarr",)),

@@ -10,13 +10,16 @@ from __future__ import annotations
 SUITES = {
     "between": "btfref.bench.experiments.between",
     "demand": "btfref.bench.demand",
+    "directions": "btfref.bench.experiments.directions",
     "env": "btfref.bench.experiments.env",
     "factors": "btfref.bench.experiments.factors",
     "gbrdf": "btfref.bench.experiments.gbrdf",
     "lobes": "btfref.bench.experiments.lobes",
     "lod": "btfref.bench.experiments.lod",
+    "offgrid": "btfref.bench.experiments.offgrid",
     "proposals": "btfref.bench.experiments.proposals",
     "pyramid": "btfref.bench.experiments.pyramid",
+    "queries": "btfref.bench.experiments.queries",
     "reflectance": "btfref.bench.experiments.reflectance",
     "synth": "btfref.bench.synth",
 }

@@ -18,7 +18,21 @@ COMMANDS = (
     "realtime",
     "compare",
     "demand",
+    "query",
+    "evaluate",
     "validate",
     "bench",
     "stress",
 )
+
+#: Modules that do not stand in this folder under the command's name.
+ELSEWHERE = {
+    "evaluate": "queries.evaluate",
+    "import": "import_",  # a module cannot carry the name of a keyword
+    "query": "queries.query",
+}
+
+
+def module_of(command: str) -> str:
+    """Full name of a command's module."""
+    return f"{__name__}.{ELSEWHERE.get(command, command)}"

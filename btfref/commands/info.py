@@ -31,7 +31,9 @@ OUTPUTS = {"plot": "picture"}
 def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
     parser.add_argument(
-        "file", metavar="FILE", help="representation (.exr), sampled BTF (.btf.zarr), measured BTF, or image"
+        "file",
+        metavar="FILE",
+        help="representation (.exr), sampled BTF (.btf.zarr), queries, measured BTF, or image",
     )
     add_json(parser, "the facts")
     add_overwrite(parser)
@@ -82,8 +84,13 @@ def read(path: PathLike) -> Facts:
     """
     path = Path(path)
     if path.is_dir():
+        from btfref.commands.shared.paths import kind_of
         from btfref.sampling import open_store
 
+        if kind_of(path) == "queries":
+            from btfref.querying import open_queries
+
+            return open_queries(path).facts()
         store = (path / "zarr.json").exists() or path.name.endswith(".zarr")
         if not store and (found := _measured(path) or _foreign(path)):
             return found

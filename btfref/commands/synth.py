@@ -19,26 +19,23 @@ import functools
 import operator
 import sys
 from argparse import ArgumentParser, Namespace
+from typing import Any
 
 from btfref.commands.demand import add_scene_arguments, union, whole_shape
 from btfref.commands.shared.options import add_dtype, add_json, add_memory, add_seed
+from btfref.commands.shared.own_geometry import add_own_geometry, own_parameters
 from btfref.commands.shared.printing import Progress, bytes_text, emit, emit_json, printable
 from btfref.commands.shared.reading import (
-    assignments,
     count,
     direction_set,
     number_above,
-    numbers_or_file,
     output_file,
     ranges,
 )
+from btfref.errors import INDICES, WORKERS, InputError
 from btfref.errors import SAMPLES as MANY_SAMPLES
-from btfref.errors import WORKERS, InputError
 from btfref.sampling.settings import AUTO, ESTIMATORS, MOST_SAMPLES, SAMPLES, SynthesisSettings
 from btfref.types import Facts
-
-#: Options that are parameters of a user's mesh or height map.
-_OWN = ("bsdf", "albedo", "roughness", "amplitude", "tile", "up", "allow_seams")
 
 #: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
 OUTPUTS = {"output": "store"}
@@ -62,7 +59,8 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="texels per side (default %(default)s)",
     )
     directions = (
-        "ubo81, ubo151, a grid such as 10x5, or a .txt file of theta and phi in degrees (default %(default)s)"
+        "ubo81, ubo151, a grid such as 10x5, a .txt file of theta and phi in degrees, or adaptive:N, chosen for the "
+        "surface (default %(default)s)"
     )
     parser.add_argument("--views", default=default.views, metavar="SET", help=directions)
     parser.add_argument("--lights", default=default.lights, metavar="SET", help="likewise")
@@ -95,9 +93,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     add_seed(parser)
     add_dtype(parser)
-    parser.add_argument(
-        "--set", nargs="+", action="extend", metavar="KEY=VALUE", help="parameters of the mesostructure"
-    )
+    add_own_geometry(parser)
     parser.add_argument(
         "--estimator",
         choices=(AUTO, *ESTIMATORS),
@@ -110,27 +106,6 @@ def add_arguments(parser: ArgumentParser) -> None:
         action="store_true",
         help="leave the variance out: half the bytes, faster with surface",
     )
-    own = parser.add_argument_group("a mesh or a height map of your own")
-    own.add_argument("--bsdf", metavar="FILE.xml", help="a Mitsuba BSDF, with its textures")
-    own.add_argument(
-        "--albedo", type=numbers_or_file, metavar="IMAGE|R,G,B", help="of a height map (default 0.5,0.5,0.5)"
-    )
-    own.add_argument(
-        "--roughness", type=numbers_or_file, metavar="IMAGE|X", help="of a height map (default: Lambertian)"
-    )
-    own.add_argument(
-        "--amplitude", type=float, metavar="A", help="tile units that a height of 1 stands for (default 0.1)"
-    )
-    own.add_argument(
-        "--tile",
-        type=numbers_or_file,
-        metavar="X0,Y0,X1,Y1",
-        help="where one tile lies in the mesh, in its units, or: bounds (default 0,0,1,1)",
-    )
-    own.add_argument(
-        "--up", choices=("y", "z"), help="axis of the mesh that points up (default: glTF y, else z)"
-    )
-    own.add_argument("--allow-seams", action="store_true", default=None, help="take input that does not tile")
     for name in ("views", "lights", "tiles"):
         parser.add_argument(
             f"--only-{name}", type=ranges, metavar="I,J-K", help=f"fill these {name} now, the rest later"
@@ -170,21 +145,13 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(args: Namespace) -> int:
     """Carry the command out."""
     out = output_file(args.output, ".btf.zarr")
-    parameters = assignments(args.set)
-    for name in _OWN:
-        if getattr(args, name) is not None:
-            parameters[name] = getattr(args, name)
-    for key in parameters:
-        if key in SynthesisSettings.names():
-            option = f"--{key.replace('_', '-')}"
-            raise InputError("not a parameter of the mesostructure", field="--set", got=key, expected=option)
+    parameters = own_parameters(args, SynthesisSettings.names())
 
     from btfref.sampling.store.selection import Selection
     from btfref.sampling.synthesis import make_job
 
     chosen = vars(args) | {
-        "views": direction_set(args.views),
-        "lights": direction_set(args.lights),
+        **_directions(args, parameters),
         "variance": not args.no_variance,
     }
     settings = SynthesisSettings(**{name: chosen[name] for name in SynthesisSettings.names()})
@@ -224,6 +191,33 @@ def run(args: Namespace) -> int:
     if info["error"]:
         emit(error_text(info["error"]))
     return 0
+
+
+def _directions(args: Namespace, parameters: Facts) -> Facts:
+    """Views and lights: sets, files, or as many as are asked for, chosen for the surface."""
+    from btfref.sampling.chosen_directions import ADAPTIVE, chosen_directions
+
+    made: dict[str, Any] = {}
+    for text in (args.views, args.lights):
+        kind, _, number = text.partition(":")
+        if kind != ADAPTIVE:
+            made[text] = direction_set(text)
+        elif args.scenes:
+            raise InputError(
+                "a set that is chosen for the surface", field="--for", got=text, expected="another"
+            )
+        elif not number.isdecimal() or len(number) > len(str(INDICES.most)):
+            raise InputError("unknown set of directions", got=text[:40], expected=f"{ADAPTIVE}:N")
+        elif text not in made:
+            made[text] = chosen_directions(
+                args.mesostructure,
+                int(number),
+                seed=args.seed,
+                max_depth=args.max_depth,
+                variant=args.variant,
+                **parameters,
+            )
+    return {"views": made[args.views], "lights": made[args.lights]}
 
 
 def error_text(error: Facts) -> str:

@@ -43,25 +43,58 @@ def write_job(path: PathLike, job: Job, only: Selection | None, plan: Plan | Non
         for name in SynthesisSettings.names()
         if name not in ("views", "lights")
     }
-    made = job.mesostructure
     data: Facts = {
         "btfref": __version__,
         "versions": job.attributes["versions"],
         "settings": settings | {"views": job.views.vectors, "lights": job.lights.vectors},
         "names": [job.views.name, job.lights.name],
-        "mesostructure": {
-            "name": made.name,
-            "parameters": made.parameters,
-            "ignored": made.ignored,
-            "parts": [
-                {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
-                for part in made.parts
-            ],
-        },
+        "mesostructure": mesostructure_facts(job.mesostructure),
         "only": None if only is None else dataclasses.asdict(only),
         "plan": None if plan is None else dataclasses.asdict(plan),
     }
+    write_facts(path, data)
+
+
+def mesostructure_facts(made: Mesostructure) -> Facts:
+    """Geometry and materials, for :func:`write_facts`."""
+    return {
+        "name": made.name,
+        "parameters": made.parameters,
+        "ignored": made.ignored,
+        "parts": [
+            {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
+            for part in made.parts
+        ],
+    }
+
+
+def mesostructure_of(made: Facts) -> Mesostructure:
+    """The mesostructure whose :func:`mesostructure_facts` these are."""
+    parts = tuple(Part(**part) for part in made["parts"])
+    return Mesostructure(made["name"], made["parameters"], parts, tuple(made["ignored"]))
+
+
+def write_facts(path: PathLike, data: Facts) -> None:
+    """Write facts with arrays among them."""
     Path(path).write_text(json.dumps(data, default=_packed), "utf-8")
+
+
+def read_facts(path: PathLike) -> Facts:
+    """What :func:`write_facts` wrote.
+
+    Raises
+    ------
+    InputError
+        Of another version of btfref.
+    ValueError, KeyError
+        Not such a file.
+    """
+    data = json.loads(Path(path).read_text("utf-8"), object_hook=_unpacked)
+    if data["btfref"] != __version__:
+        raise InputError(
+            "a worker of another version", field="btfref", got=__version__, expected=data["btfref"]
+        )
+    return data
 
 
 def read_job(path: PathLike) -> tuple[Job, Selection | None, Plan | None]:
@@ -83,13 +116,8 @@ def read_job(path: PathLike) -> tuple[Job, Selection | None, Plan | None]:
         Not such a file, or one of another version than this process's libraries.
     """
     try:
-        data = json.loads(Path(path).read_text("utf-8"), object_hook=_unpacked)
-        written = data["btfref"]
-        if written != __version__:
-            raise InputError("a worker of another version", field="btfref", got=__version__, expected=written)
-        made = data["mesostructure"]
-        parts = tuple(Part(**part) for part in made["parts"])
-        mesostructure = Mesostructure(made["name"], made["parameters"], parts, tuple(made["ignored"]))
+        data = read_facts(path)
+        mesostructure = mesostructure_of(data["mesostructure"])
         settings = SynthesisSettings(**data["settings"])
         only = data["only"] and Selection(**data["only"])
         plan = data["plan"] and Plan(**data["plan"])

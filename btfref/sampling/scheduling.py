@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, TypedDict
 
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 #: Tasks per worker: enough that a slow or lost worker costs little, few enough that scenes are not built for nothing.
 TASKS_PER_WORKER = 6
 
-#: One synthesis at a time in a process: Mitsuba's threads use all that the worker may use.
-_LOCK = threading.Lock()
+#: One task at a time in a process: Mitsuba's threads use all that the worker may use.
+LOCK = threading.Lock()
 
 
 #: None, the name or the address of a cluster, or a client of one.
 Scheduler: TypeAlias = "str | distributed.Client | None"
 
 
-class _Means(TypedDict):
+class Means(TypedDict):
     """What a worker is told: its budget in bytes, None for half of its machine's; its threads, None for as it is."""
 
     memory: int | None
@@ -99,14 +99,14 @@ def run(
         return peak()
     if not views:
         return peak()
-    with _client(scheduler, workers, memory) as (client, settings):
+    with cluster(scheduler, workers, memory) as (client, settings):
         return max(peak(), _distribute(client, job, store, views, stage, only, plan, settings, done))
 
 
 @contextlib.contextmanager
-def _client(
+def cluster(
     scheduler: Scheduler, workers: int | None, memory: int | None
-) -> Iterator[tuple[distributed.Client, _Means]]:
+) -> Iterator[tuple[distributed.Client, Means]]:
     """A client, and what its workers are told: budget and threads of each."""
     try:
         import distributed
@@ -136,8 +136,8 @@ def _client(
                 dashboard_address="127.0.0.1:0",  # any free port: clusters may stand side by side
                 memory_limit=0,  # the budget is kept by what is made together, not by killing
                 silence_logs=logging.CRITICAL,
-            ) as cluster,
-            distributed.Client(cluster) as client,
+            ) as local,
+            distributed.Client(local) as client,
         ):
             yield client, {"memory": budget // count, "threads": max(1, cores // count)}
         return
@@ -180,14 +180,11 @@ def _distribute(
     stage: str,
     only: Selection | None,
     plan: Plan | None,
-    settings: _Means,
+    settings: Means,
     done: Callable[[int], None],
 ) -> int:
-    """Hand the views out; what a lost worker had not finished goes to another."""
-    import distributed
-    from distributed.comm.core import CommClosedError
-
-    _refuse_other_versions(client)
+    """Hand the views out."""
+    refuse_other_versions(client)
     count = max(1, len(client.nthreads()))
     if job.settings.estimator == "surface":
         # Points and their walks serve all views of a task: as few tasks as there are workers.
@@ -199,48 +196,80 @@ def _distribute(
     from btfref.sampling.job_file import write_job
 
     write_job(order, job, only, plan)
+    pieces = [views[first : first + size] for first in range(0, len(views), size)]
     try:
-        tasks = [
-            client.submit(
-                _work,
-                str(order.resolve()),
-                str(store.path.resolve()),
-                views[first : first + size],
-                stage,
-                settings,
-                pure=False,
-                retries=2,
-            )
-            for first in range(0, len(views), size)
-        ]
-        largest = 0
-        try:
-            for future in distributed.as_completed(tasks):
-                count, used = future.result()
-                largest = max(largest, used)
-                done(count)
-        except distributed.scheduler.KilledWorker as error:
-            raise InputError(
-                "workers were lost again and again; start the same command again to go on",
-                file=store.path,
-                got=str(error).partition("\n")[0],
-            ) from None
-        except (distributed.CancelledError, CommClosedError, TimeoutError) as error:
-            raise InputError(
-                "the scheduler is gone; start the same command again to go on",
-                file=store.path,
-                field="scheduler",
-                got=f"{type(error).__name__} {error}".partition("\n")[0],
-            ) from None
-        finally:
-            with contextlib.suppress(Exception):  # a cluster that is gone cannot be told
-                client.cancel(tasks)
-        return largest
+        path = str(store.path.resolve())
+        return hand_out(
+            client,
+            _work,
+            [(str(order.resolve()), path, part, stage, settings) for part in pieces],
+            store.path,
+            done,
+        )
     finally:
         order.unlink(missing_ok=True)
 
 
-def _refuse_other_versions(client: distributed.Client) -> None:
+def hand_out(
+    client: distributed.Client,
+    work: Callable[..., tuple[int, int]],
+    pieces: Sequence[tuple[object, ...]],
+    path: Path,
+    done: Callable[[int], None],
+) -> int:
+    """Give workers their pieces and wait for all; what a lost worker had not finished goes to another.
+
+    Parameters
+    ----------
+    client : distributed.Client
+    work : callable
+        Of a module, called with a piece's arguments; tells how much it has made and its largest memory.
+    pieces : list of tuple
+    path : Path
+        What is written, for messages.
+    done : callable
+        Called with what a piece has made.
+
+    Returns
+    -------
+    int
+        Largest memory (bytes) of a worker.
+
+    Raises
+    ------
+    InputError
+        Workers or the scheduler are lost.
+    """
+    import distributed
+    from distributed.comm.core import CommClosedError
+
+    tasks = [client.submit(work, *piece, pure=False, retries=2) for piece in pieces]
+    largest = 0
+    try:
+        for future in distributed.as_completed(tasks):
+            count, used = future.result()
+            largest = max(largest, used)
+            done(count)
+    except distributed.scheduler.KilledWorker as error:
+        raise InputError(
+            "workers were lost again and again; start the same command again to go on",
+            file=path,
+            got=str(error).partition("\n")[0],
+        ) from None
+    except (distributed.CancelledError, CommClosedError, TimeoutError) as error:
+        raise InputError(
+            "the scheduler is gone; start the same command again to go on",
+            file=path,
+            field="scheduler",
+            got=f"{type(error).__name__} {error}".partition("\n")[0],
+        ) from None
+    finally:
+        with contextlib.suppress(Exception):  # a cluster that is gone cannot be told
+            client.cancel(tasks)
+    return largest
+
+
+def refuse_other_versions(client: distributed.Client) -> None:
     """InputError for a worker of another btfref; those that join later are told by the job's file."""
     from btfref.provenance import __version__
 
@@ -264,13 +293,13 @@ def _version() -> str:
     return __version__
 
 
-def _work(order: str, path: str, views: list[int], stage: str, settings: _Means) -> tuple[int, int]:
+def _work(order: str, path: str, views: list[int], stage: str, settings: Means) -> tuple[int, int]:
     """What a worker does: fill its views; the number of views and the worker's largest memory."""
     from distributed import get_worker
 
     from btfref.sampling.job_file import read_job
 
-    with _LOCK:
+    with LOCK:
         if not Path(order).is_file():
             raise InputError(
                 "a worker does not see the folder of the store",
@@ -283,7 +312,7 @@ def _work(order: str, path: str, views: list[int], stage: str, settings: _Means)
                 "a worker does not see the store", file=path, expected="the same path everywhere"
             )
         store = open_store(path)
-        _use_threads(job, settings["threads"] or get_worker().state.nthreads)
+        use_threads(job.settings.variant, settings["threads"] or get_worker().state.nthreads)
         memory = default_budget() if settings["memory"] is None else settings["memory"]
         fill_views(
             job,
@@ -297,11 +326,11 @@ def _work(order: str, path: str, views: list[int], stage: str, settings: _Means)
         return len(views), peak()
 
 
-def _use_threads(job: Job, threads: int) -> None:
+def use_threads(variant: str, threads: int) -> None:
     """Tell Dr.Jit how many threads this worker may use."""
     from btfref.sampling.variant import mitsuba_variant
 
-    with mitsuba_variant(job.settings.variant):
+    with mitsuba_variant(variant):
         import drjit as dr
 
         if dr.thread_count() != threads:

@@ -21,7 +21,7 @@ btfref.stress
 btfref
 btfref.rendering
 btfref.scene
-mitsuba_plugins btfref.formats
+mitsuba_plugins btfref.formats btfref.querying
 btfref.representations
 btfref.sampling
 btfref.mesostructure

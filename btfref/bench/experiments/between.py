@@ -19,6 +19,7 @@ from btfref.errors import InputError
 from btfref.registry import methods
 
 if TYPE_CHECKING:
+    from btfref.numerics.sphere.directions import DirectionSet
     from btfref.representations.protocol import Representation
     from btfref.sampling import SampledBTF
     from btfref.types import Facts
@@ -73,42 +74,49 @@ def run(options: Options) -> Facts:
     }
 
 
-def _chosen(options: Options) -> tuple[Sequence[str], Sequence[str], Sequence[str]]:
+def _chosen(options: Options) -> list[Sequence[str]]:
     """Mesostructures, sets and methods that are asked for."""
     axes: list[Sequence[str]] = [MESOSTRUCTURES, SETS, list(methods())]
     if options.quick:
         axes[:2] = MESOSTRUCTURES[:1], SETS[:1]
+    return chosen_of(axes, options)
+
+
+def chosen_of(axes: Sequence[Sequence[str]], options: Options) -> list[Sequence[str]]:
+    """Of each axis the names in ``options.only``, or all where none of them is there.
+
+    Raises
+    ------
+    InputError
+        For a name that is on no axis.
+    """
     known = {name for axis in axes for name in axis}
     if unknown := [name for name in options.only or () if name not in known]:
         raise InputError("nothing of that name", field="--only", got=", ".join(unknown))
-    chosen = [[name for name in axis if name in (options.only or ())] or axis for axis in axes]
-    return chosen[0], chosen[1], chosen[2]
+    return [[name for name in axis if name in (options.only or ())] or axis for axis in axes]
+
+
+def fitted_to(name: str, directions: str | DirectionSet, options: Options) -> SampledBTF:
+    """What methods are fitted to: a mesostructure at a set of directions."""
+    from btfref.sampling.synthesis import synthesize
+
+    return synthesize(
+        name,
+        texels=TEXELS,
+        views=directions,
+        lights=directions,
+        spp=SPP,
+        estimator="surface",
+        progress=options.progress,
+    )
 
 
 def _materials(
     options: Options, names: Sequence[str], sets: Sequence[str]
 ) -> list[tuple[str, str, SampledBTF]]:
-    from btfref.sampling.synthesis import synthesize
-
     if options.btf is not None:
         return [(material_name(options.btf), options.btf.views.name, options.btf)]
-    return [
-        (
-            name,
-            directions,
-            synthesize(
-                name,
-                texels=TEXELS,
-                views=directions,
-                lights=directions,
-                spp=SPP,
-                estimator="surface",
-                progress=options.progress,
-            ),
-        )
-        for name in names
-        for directions in sets
-    ]
+    return [(name, directions, fitted_to(name, directions, options)) for name in names for directions in sets]
 
 
 def _true_values(name: str, options: Options) -> SampledBTF:

@@ -21,6 +21,7 @@ KINDS = {
     "picture": "a picture",
     "page": "a report",
     "store": "a sampled BTF",
+    "queries": "queries",
     "folder": "a folder",
     "file": "a file of another kind",
 }
@@ -56,7 +57,7 @@ def check_paths(args: Namespace, outputs: Mapping[str, str]) -> None:
     for name, text in written.items():
         option = "-o" if name == "output" else f"--{name}"
         wanted = outputs[name] or _kind_by_name(text)
-        _refuse_input(Path(text), option, inputs, store=wanted == "store")
+        _refuse_input(Path(text), option, inputs, store=wanted in ("store", "queries"))
         _refuse_other(Path(text), option, wanted, overwrite=getattr(args, "overwrite", False))
         if name == "output" and getattr(args, "png", False):
             _refuse_input(Path(text).with_suffix(".png"), "--png", inputs)
@@ -149,14 +150,14 @@ def _refuse_other(path: Path, option: str, wanted: str, *, overwrite: bool) -> N
     mode = path.stat().st_mode
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise InputError("a pipe or device, not a file", file=path, field=option)
-    if stat.S_ISDIR(mode) and wanted not in ("store", "folder", ""):
+    if stat.S_ISDIR(mode) and wanted not in ("store", "queries", "folder", ""):
         raise InputError("a folder has that name", file=path, field=option, expected="the name of a file")
     if stat.S_ISREG(mode) and wanted == "folder":
         raise InputError("a file has that name", file=path, field=option, expected="the name of a folder")
     found = kind_of(path)
     if overwrite or not wanted or found in (wanted, ""):
         return
-    if wanted == "folder" and found != "store":
+    if wanted == "folder" and found not in ("store", "queries"):
         return
     if wanted == "text" and found == "file":
         return
@@ -173,6 +174,7 @@ def _kind_by_name(text: str) -> str:
     """What a name stands for where a command writes several kinds."""
     ends = {
         ".btf.zarr": "store",
+        ".queries.zarr": "queries",
         ".exr": "representation",
         ".png": "picture",
         ".html": "page",
@@ -194,7 +196,7 @@ def kind_of(path: Path) -> str:
     str
     """
     if path.is_dir():
-        return "store" if (path / "zarr.json").is_file() else "folder"
+        return _kind_of_folder(path)
     try:
         with path.open("rb") as stream:
             head = stream.read(4096)
@@ -207,6 +209,14 @@ def kind_of(path: Path) -> str:
     if head.lstrip()[:9].lower().startswith((b"<!doctype", b"<html")):
         return "page"
     return "file" if head else ""
+
+
+def _kind_of_folder(path: Path) -> str:
+    try:
+        head = (path / "zarr.json").read_bytes()
+    except OSError:
+        return "folder"
+    return "queries" if b'"btf-queries"' in head else "store"
 
 
 def _first_header(path: Path) -> bytes:

@@ -154,7 +154,13 @@ class PathEstimator:
         self._tell(pieces)
         # Everything that changes between passes is in arrays: one kernel then serves all of them.
         lane = dr.arange(mi.UInt32, sum(piece.n_lanes for piece in pieces))
-        w_view = dr.gather(mi.Vector3f, self._views, dr.gather(mi.UInt32, self._piece, lane))
+        self._trace(lane, dr.gather(mi.Vector3f, self._views, dr.gather(mi.UInt32, self._piece, lane)))
+
+    def _trace(self, lane: JitArray, w_view: JitArray) -> None:
+        """Trace one path a lane, seen along its view, and connect its vertices."""
+        import drjit as dr
+        import mitsuba as mi
+
         origin = self._footprint(lane, self._keys(lane), w_view)
         state = (lane, origin, mi.Vector3f(-w_view), mi.Color3f(1.0))
         n_vertices = self.max_depth - 1 if self.max_depth > 0 else 2**31
@@ -245,13 +251,7 @@ class PathEstimator:
 
         def connect(i: JitArray) -> tuple[JitArray]:
             w_light = dr.gather(mi.Vector3f, lights, start + i)
-            value = throughput * bsdf.eval(context, interaction, interaction.to_local(w_light), active)
-            lit = active & (dr.max(value) > 0)
-            ray = interaction.spawn_ray(w_light)
-            if self.tiles.masked:
-                value *= self.tiles.transmittance(ray, lit)
-            else:
-                lit &= ~self.tiles.occluded(ray, lit)
+            value, lit = self._light(interaction, bsdf, context, throughput, w_light, active)
             index = dr.fma(i, 3 * n_lanes, mine)
             for channel in range(3):
                 at = index + channel * n_lanes
@@ -263,6 +263,27 @@ class PathEstimator:
             return (i + 1,)
 
         dr.while_loop((mi.UInt32(0) + dr.zeros(mi.UInt32, dr.width(lane)),), lambda i: i < n_lit, connect)
+
+    def _light(
+        self,
+        interaction: JitArray,
+        bsdf: JitArray,
+        context: JitArray,
+        throughput: JitArray,
+        w_light: JitArray,
+        active: JitArray,
+    ) -> tuple[JitArray, JitArray]:
+        """Throughput · f cos · visibility of a light at the vertices, and where it is not 0."""
+        import drjit as dr
+
+        value = throughput * bsdf.eval(context, interaction, interaction.to_local(w_light), active)
+        lit = active & (dr.max(value) > 0)
+        ray = interaction.spawn_ray(w_light)
+        if self.tiles.masked:
+            value *= self.tiles.transmittance(ray, lit)
+        else:
+            lit &= ~self.tiles.occluded(ray, lit)
+        return value, lit
 
     def _statistics(self, pieces: Sequence[Piece]) -> list[tuple[np.ndarray, ...]]:
         """Mean and variance of the mean from the samples of the last pass: two (n_lit, texels, 3) arrays a piece."""
