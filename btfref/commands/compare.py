@@ -127,8 +127,8 @@ def _against_scene(args: Namespace, test: np.ndarray) -> tuple[Comparison, Facts
             cache=args.cache,
             progress=progress,
         )
-    # Under an environment the reference is a plain rendering of the scene.
-    noisy = found.variance is not None
+    # With shadows under an environment the reference is a plain rendering of the scene.
+    noisy = shadows and found.variance is not None
     facts = {
         **scene_content(args.reference, parameters, size=size),
         "grid": None if noisy else args.grid,

@@ -77,7 +77,7 @@ def reference_of(
     size : (int, int), optional
         Width and height in place of the scene's.
     grid : int
-        n of the n × n sub-pixel samples under delta lights, which leave no noise.
+        n of the n × n sub-pixel samples; with shadows under an environment the samples are random.
     shadows : bool
         Cast shadows. Under an environment the scene as its file says with them, and direct light alone without.
     spp : int
@@ -106,7 +106,7 @@ def reference_of(
         "representations": sorted(digest_of(file) for file in files),
         "size": size,
         "delta": description.environment is None,
-        "settings": [grid if description.environment is None else spp, shadows],
+        "settings": [grid, shadows] if description.environment is None else [grid, shadows, spp],
         "code": code_of(__name__, *(read_info(file)["method"] for file in files)),
     }
 
@@ -140,7 +140,11 @@ def _render(
     if delta:
         return made | {"image": render(path, grid=grid, shadows=shadows, **shared).image}
     inside = kinds == PixelClass.INTERIOR
-    result = converged(path, inside, gate=NOISY, shadows=shadows, most=spp, progress=progress, **shared)
+    # An integrator of its own takes its own samples; direct light is taken where the grid has them.
+    at = None if shadows else grid
+    result = converged(
+        path, inside, gate=NOISY, shadows=shadows, grid=at, most=spp, progress=progress, **shared
+    )
     return made | {"image": result.image, "variance": result.variance}
 
 

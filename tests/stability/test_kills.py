@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -70,19 +71,28 @@ def test_killed_commands_end_with_the_same_bytes(material, tmp_path, name, rng):
     assert child(*COMMANDS[name](material, whole)).wait() == 0
     longest = os.times().elapsed - started
     killed = 0
-    for _ in range(KILLS):
+    for _ in range(10 * KILLS):
+        started = os.times().elapsed
         process = child(*COMMANDS[name](material, broken))
         try:
             process.wait(rng.uniform(0.3, 1) * longest)
+            longest = max(
+                0.9 * longest, os.times().elapsed - started
+            )  # what a slower machine took is no measure
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGKILL)
             killed += process.wait() == -signal.SIGKILL
         out = next((p for p in broken.iterdir() if p.name.startswith("out")), None)
+        whole_by_now = process.returncode == 0
         if name != "import" and out is not None:
             # It appears whole or not at all.
             assert contents(out) == contents(whole / out.name)
+            whole_by_now = True
+        if out is not None and whole_by_now:
             shutil.rmtree(out) if out.is_dir() else out.unlink()
-    assert killed > KILLS // 4
+        if killed == KILLS:
+            break
+    assert killed == KILLS
     assert child(*COMMANDS[name](material, broken)).wait() == 0
     assert sorted(p.name for p in broken.iterdir()) == sorted(p.name for p in whole.iterdir())
     for path in whole.iterdir():
@@ -99,8 +109,11 @@ def test_a_reader_beside_a_killed_writer(material, tmp_path, rng):
     expected = open_store(whole).read()[0]
     read = 0
     for _ in range(KILLS):
+        if read and out.exists() and open_store(out).coverage.all():
+            shutil.rmtree(out)
         process = child("import", material / "pictures", "-o", out)
-        while process.poll() is None and rng.random() > 1e-3:
+        reads = rng.integers(1, 40)  # until the writer is killed
+        while process.poll() is None and reads:
             if not out.exists():
                 continue
             try:
@@ -108,6 +121,7 @@ def test_a_reader_beside_a_killed_writer(material, tmp_path, rng):
                 for view in np.flatnonzero(store.coverage.all(axis=(1, 2, 3)))[:3]:
                     assert np.array_equal(store.read(views=int(view))[0][0], expected[view])
                     read += 1
+                reads -= 1
             except InputError:
                 continue
         process.send_signal(signal.SIGKILL)
@@ -177,5 +191,11 @@ def test_a_terminated_validation_leaves_no_process(tmp_path):
     process.send_signal(signal.SIGTERM)
     _, said = process.communicate()
     assert (process.returncode, said) == (143, b"btfref: error: terminated\n")
-    with pytest.raises(ProcessLookupError):
-        os.killpg(process.pid, 0)
+    # Processes that were told to end take a moment to be gone.
+    for _ in range(100):
+        try:
+            os.killpg(process.pid, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.1)
+    pytest.fail("a process is still there ten seconds later")

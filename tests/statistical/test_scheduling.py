@@ -165,7 +165,7 @@ def test_a_scheduler_that_dies_is_one_line_and_the_run_goes_on(tmp_path, need):
     ]
     command = [sys.executable, "-m", "btfref", "synth", "checker", *settings, "-o"]
     try:
-        while not where.exists():
+        while not (where.exists() and where.stat().st_size):
             assert scheduler.poll() is None
         address = json.loads(where.read_text())["address"]
         run = subprocess.Popen(

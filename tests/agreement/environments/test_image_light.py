@@ -22,7 +22,7 @@ from btfref.rendering.gl import composer, device
 from btfref.rendering.gl.probe import probe_environment
 from btfref.rendering.gl.realtime import realtime
 from btfref.rendering.offline.approximate import approximate
-from btfref.rendering.offline.reference import render
+from btfref.rendering.offline.converged import converged
 from btfref.scene.description import read_scene
 from btfref.scene.environment import Environment, bright_texel, constant
 from btfref.scene.environments import studio
@@ -185,18 +185,10 @@ def test_pictures_are_near_the_path_tracer(under_sky, key):
     parameters = under_sky(key)
     image = realtime(read_scene(SPHERE, parameters, size=SIZE), grid=4)
     classes = pixel_classes(SPHERE, parameters=parameters, grid=4, size=SIZE)
-    inside = classes == PixelClass.INTERIOR
-    spp = 256
-    while True:
-        reference = render(SPHERE, parameters=parameters, spp=spp, seed=1, size=SIZE, with_variance=True)
-        noise = np.sqrt(reference.variance[inside].mean()) / reference.image[inside].mean()
-        limit = tolerance("reference.standard_error.max_fraction") * tolerance(
-            "image.environment.relative_rmse"
-        )
-        if noise <= limit:
-            break
-        spp = int(spp * max(2.0, 1.2 * (noise / limit) ** 2))
-        assert spp < 1 << 17
+    strict = np.isin(classes, (PixelClass.INTERIOR, PixelClass.EDGE))
+    shared = {"parameters": parameters, "size": SIZE, "shadows": False, "grid": 4}
+    reference = converged(SPHERE, strict, gate="image.environment", **shared)
+    assert reference.meta["noise_ratio"] <= 1
     found = compare(image, reference, classes=classes, gate="image.environment", flip=False)
     assert found.passed, [gate.line for gate in found.gates]
 
