@@ -58,9 +58,9 @@ def test_shadows_are_those_of_opengl(fits):
     image, expected = webgl(scene_file("bowl"), **options), realtime(scene_file("bowl"), **options)
     bare = realtime(scene_file("bowl"), **{**options, "shadows": False})
     classes = pixel_classes(scene_file("bowl"), **options)
-    found = compare(image, expected, classes=classes, gate="image.noise_free", flip=False)
+    found = compare(image, expected, classes=classes, gate="image.browser", flip=False)
     assert found.passed, [gate.line for gate in found.gates]
-    assert not compare(image, bare, classes=classes, gate="image.noise_free", flip=False).passed
+    assert not compare(image, bare, classes=classes, gate="image.browser", flip=False).passed
 
 
 PROTOTYPE = "WebGL2RenderingContext.prototype"
