@@ -25,7 +25,7 @@ WAYS = {
     "sh": ("lpca", "harmonics", {"order": 3}),
     "transfer": (
         "lpca",
-        "envmap",
+        "harmonics",
         {"order": 3, "transfer": TransferSettings(clusters=6, components=3, bits=8)},
     ),
 }
