@@ -112,7 +112,13 @@ def test_one_picture_of_each_method(reference, key):
     assert_same_picture(reference, key, *ONE, QUICK)
 
 
-@pytest.mark.parametrize("key", methods())
+#: Methods whose picture the browser draws in the default run: a table, levels of detail, a geometry of its own.
+DRAWN = (FIRST, "laplacian", "gbrdf")
+
+
+@pytest.mark.parametrize(
+    "key", [pytest.param(key, marks=[] if key in DRAWN else pytest.mark.long) for key in methods()]
+)
 def test_one_picture_of_each_method_in_the_browser(reference, need, key):
     need("chromium")
     assert_same_picture(reference, key, *ONE, QUICK, **IN_BROWSER)

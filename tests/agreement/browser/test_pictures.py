@@ -36,7 +36,10 @@ def _browser(need):
     need("chromium")
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(
+    "way",
+    ["lights", "sh", *(pytest.param(way, marks=pytest.mark.long) for way in ("prefiltered", "transfer"))],
+)
 def test_environments_equal_float64(fits, way):
     key, environment, settings = WAYS[way]
     parameters = {"btf": str(fits.path(key)), "lights": "envmap", "environment": environment}
