@@ -13,6 +13,7 @@ from btfref.registry import methods
 from btfref.rendering.gl import device
 from btfref.rendering.gl.realtime import realtime
 from btfref.rendering.offline.reference import render
+from btfref.rendering.web.context import webgl
 from btfref.representations import save
 from btfref.scene.pixel_classes import pixel_classes
 
@@ -89,10 +90,14 @@ def reference(saved, classes_of):
     return get
 
 
-def assert_same_picture(reference, key, name, lights, settings):
+#: Its rasterizer is coarser.
+IN_BROWSER = {"draw": webgl, "gate": ("image.browser", "image.browser_edges", "image.background")}
+
+
+def assert_same_picture(reference, key, name, lights, settings, draw=realtime, gate=GATES):
     path, parameters, expected, classes = reference(key, name, lights, **settings)
-    image = realtime(path, parameters=parameters, shadows=False, **settings)
-    comparison = compare(image, expected, classes=classes, gate=GATES, flip=False)
+    image = draw(path, parameters=parameters, shadows=False, **settings)
+    comparison = compare(image, expected, classes=classes, gate=gate, flip=False)
     assert comparison.passed, [gate.line for gate in comparison.gates if not gate.passed]
     # The scene fills the picture and is lit: the gates saw something.
     assert (classes == PixelClass.INTERIOR).mean() > tolerance("rendered.subject.min_covered_full")
@@ -105,6 +110,26 @@ def assert_same_picture(reference, key, name, lights, settings):
 @pytest.mark.parametrize("key", OTHERS)
 def test_one_picture_of_each_method(reference, key):
     assert_same_picture(reference, key, *ONE, QUICK)
+
+
+#: Methods whose picture the browser draws in the default run: a table, levels of detail, a geometry of its own.
+DRAWN = (FIRST, "laplacian", "gbrdf")
+
+
+@pytest.mark.parametrize(
+    "key", [pytest.param(key, marks=[] if key in DRAWN else pytest.mark.long) for key in methods()]
+)
+def test_one_picture_of_each_method_in_the_browser(reference, need, key):
+    need("chromium")
+    assert_same_picture(reference, key, *ONE, QUICK, **IN_BROWSER)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("lights", LIGHTS)
+@pytest.mark.parametrize("name", SCENES)
+def test_every_scene_in_the_browser(reference, need, name, lights):
+    need("chromium")
+    assert_same_picture(reference, FIRST, name, lights, LONG, **IN_BROWSER)
 
 
 @pytest.mark.parametrize("lights", LIGHTS)

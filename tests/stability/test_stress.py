@@ -177,6 +177,7 @@ def test_malformed_lookups_are_counted(fits):
 
 def test_every_port_counts_malformed_lookups(fits, llvm, need, monkeypatch):
     need("gl")
+    need("chromium")
     findings = list(runner.stress_lookups(fits("raw"), "formula", MEASURED, n=1024))
     counted = [f for f in findings if f.check == "malformed counted"]
     assert [f.evaluator for f in counted] == list(MEASURED)

@@ -48,7 +48,8 @@ class WebContext:
     NEAREST, ONE, TRIANGLES, POINTS = "NEAREST", "ONE", "TRIANGLES", "POINTS"
 
     def __init__(self, where: Device) -> None:
-        self._page, self._commands, self._last = where.page, [], 0
+        self._page, self._last = where.page, 0
+        self._commands: list[list[Any]] = []
         names = json.dumps(EXTENSIONS)
         self._page.evaluate(f"globalThis.gl = BtfPort.connect(new OffscreenCanvas(1, 1), {names}); 0")
         text = files(__package__).joinpath("webgl.js").read_text("utf-8")
