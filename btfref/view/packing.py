@@ -10,7 +10,8 @@ import numpy as np
 from btfref.errors import InputError
 from btfref.types import Facts
 
-#: Bytes of all tables of a page. Base64 makes 4/3 of them, and Chromium's strings end at 512 MiB.
+#: Letters of all tables of a page, packed. Chromium's strings end at 512 MiB, and a browser holds a table several times
+#: while it is unpacked.
 LARGEST = 256 << 20
 
 #: Above this many bytes compression has to be quick.
@@ -22,7 +23,7 @@ class Packed:
 
     def __init__(self) -> None:
         self.blobs: dict[str, str] = {}
-        self.nbytes = 0
+        self.letters = 0
 
     def add(self, values: np.ndarray) -> Facts:
         """Keep a table.
@@ -39,20 +40,20 @@ class Packed:
         Raises
         ------
         InputError
-            When all tables are larger than a page can hold.
+            When all tables together are larger than a page can hold.
         """
-        self.nbytes += values.nbytes
-        if self.nbytes > LARGEST:
-            raise InputError(
-                "too much for a page",
-                field="tables",
-                got=f"{self.nbytes >> 20} MiB",
-                expected=f"at most {LARGEST >> 20} MiB: a compressed method, or fewer files",
-            )
         little = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
         # First bytes, then second ones, and so on: those with the exponents repeat.
         planes = little.view(np.uint8).reshape(-1, values.dtype.itemsize).T.tobytes()
         name = f"table-{len(self.blobs)}"
         packed = zlib.compress(planes, 1 if values.nbytes > _LARGE else 6)
+        self.letters += 4 * (-(-len(packed) // 3))
+        if self.letters > LARGEST:
+            raise InputError(
+                "too much for a page",
+                field="tables",
+                got=f"{self.letters >> 20} MiB, packed",
+                expected=f"at most {LARGEST >> 20} MiB: a compressed method, or fewer files",
+            )
         self.blobs[name] = base64.b64encode(packed).decode("ascii")
         return {"blob": name, "type": values.dtype.name}

@@ -79,6 +79,9 @@ class Device {
     gl.texImage3D(target, 0, internal, width, height, layers, 0, format, kind, padded);
     gl.texParameteri(target, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
     gl.texParameteri(target, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    const error = gl.getError();
+    if (error === gl.OUT_OF_MEMORY || error === gl.INVALID_VALUE)
+      throw new Error(`The graphics device has no room for a table of ${Math.ceil(padded.byteLength / 2 ** 20)} MiB.`);
     return { texture, target };
   }
 

@@ -39,11 +39,11 @@ class Panel {
       details.open = this.data.materials.length === 1 && innerWidth > 900;
       details.append(summary);
       if (note) {
-        const text = document.createElement("p");
+        const text = document.createElement("p"), notes = document.getElementById("notes");
         text.className = "note";
-        text.textContent = note;
-        details.append(text);
-        details.open = true;
+        text.textContent = this.data.materials.length > 1 ? `${name}: ${note}` : note;
+        notes.append(text);
+        notes.hidden = false;
       }
       details.append(pre);
       root.append(details);

@@ -2,6 +2,7 @@
 const TYPES = { float16: Uint16Array, float32: Float32Array, uint32: Uint32Array, uint8: Uint8Array };
 
 async function unpacked({ blob, type }) {
+  if (!globalThis.DecompressionStream) throw new Error("This browser is too old for the page: it cannot unpack the tables.");
   const element = document.getElementById(blob);
   const text = atob(element.textContent);
   element.remove(); // it is as large as the table
