@@ -108,7 +108,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--no-variance",
         action="store_true",
-        help="leave the variance out: half the bytes, faster with surface",
+        help="leave the variance out: a third of the bytes, faster with surface",
     )
     own = parser.add_argument_group("a mesh or a height map of your own")
     own.add_argument("--bsdf", metavar="FILE.xml", help="a Mitsuba BSDF, with its textures")
