@@ -104,7 +104,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--no-variance",
         action="store_true",
-        help="leave the variance out: half the bytes, faster with surface",
+        help="leave the variance out: a third of the bytes, faster with surface",
     )
     for name in ("views", "lights", "tiles"):
         parser.add_argument(

@@ -70,7 +70,7 @@ class SynthesisSettings:
         Largest relative standard error of a texel of a view (over lights and channels), relative to its mean
         or to a tenth of the whole's. With a target error only; by default no limit.
     variance : bool
-        Whether the variance of the mean is made and kept. Without it the surface estimator is faster by a quarter.
+        Whether the variance of the mean is made and kept. Without it the surface estimator is faster by a tenth.
 
     Raises
     ------

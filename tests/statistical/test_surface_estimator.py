@@ -153,6 +153,9 @@ def test_paths_take_over_where_points_cannot(bsdf, word):
     made = synthesize("flat", **settings)
     assert made.attributes["estimator"] == "path"
     assert synthesize("flat", **settings | {"estimator": "auto"}).attributes == made.attributes
+    assert (
+        synthesize("flat", **SMALL | {"texels": 2, "estimator": "auto"}).attributes["estimator"] == "surface"
+    )
     assert word in made.attributes["fallback"]
     assert np.array_equal(made.values, synthesize("flat", **settings | {"estimator": "path"}).values)
     assert "fallback" not in synthesize("flat", **SMALL | {"texels": 2}).attributes

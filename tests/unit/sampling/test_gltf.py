@@ -285,7 +285,9 @@ def test_what_is_ignored_is_named_once_and_stands_in_the_store(tmp_path, llvm, c
     out = tmp_path / "m.btf.zarr"
     small = ["--texels", "2", "--views", "1x3", "--lights", "1x3", "--spp", "2"]
     assert main(["synth", str(file), "-o", str(out), *small]) == 0
-    lines = capsys.readouterr().err.splitlines()
+    said = capsys.readouterr()
+    assert said.out.startswith(f"estimator: {open_store(out).attributes['estimator']}\n")
+    lines = said.err.splitlines()
     warnings = [line for line in lines if "ignored" in line]
     words = ["clearcoat", "animations", "tangents", "occlusion"]
     assert [word for line in warnings for word in words if word in line] == words

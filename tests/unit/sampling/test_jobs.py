@@ -68,6 +68,24 @@ def test_numbers_of_vertices_and_what_was_ignored_come_back_as_well(tmp_path):
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize(
+    ("asked", "used", "why"),
+    [
+        ({}, "surface", None),
+        ({"bsdf": {"type": "conductor"}}, "path", "part 0 has a mirror"),
+        ({"target_error": 0.1, "spp": 16}, "surface", None),
+        ({"target_error": 0.1, "spp": 16, "texel_error": 0.5}, "path", "limit of its own"),
+        ({"target_error": 0.1, "spp": 16, "texel_error": 0.5, "estimator": "surface"}, "surface", None),
+        ({"estimator": "path"}, "path", None),
+    ],
+)
+def test_the_estimator_is_chosen_and_the_store_says_why(asked, used, why):
+    job = make_job("flat", None, {**SETTINGS, **asked})
+    assert job.settings.estimator == job.attributes["estimator"] == used
+    assert (why in job.attributes["fallback"]) if why else ("fallback" not in job.attributes)
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize(
     ("change", "words"),
     [
         (lambda data: data | {"btfref": "0.0.1"}, "another version"),
