@@ -37,8 +37,8 @@ MAX_THETA = 85.0
 #: Footprints by name: half sides of squares, in texels of the fits.
 FOOTPRINTS = {"point": 0.0, "texel": 0.5, "4 x 4 texels": 2.0}
 
-#: Rows of each footprint, samples of each half of a row, and lookups that a method averages over a footprint. Highlights
-#: are rare: many rows of few samples say more than few rows of many.
+#: Rows of each footprint, samples of each half of a row, and lookups that a method averages over a footprint.
+#: Highlights are rare: many rows of few samples say more than few rows of many.
 ROWS, SPP, LOOKUPS = 20_000, 64, 4
 
 #: Rows where less is asked for.
