@@ -29,6 +29,9 @@ FIRST = 8
 #: Of the coarse table.
 TEXELS, SPP = 4, 16
 
+#: Of the display whose light is compared.
+GAMMA = 2.4
+
 #: Name of such a set on a command line: ``adaptive:N``.
 ADAPTIVE = "adaptive"
 
@@ -94,7 +97,9 @@ def chosen_directions(
         progress=progress,
         **parameters,
     )
-    values = btf.values.astype(np.float64).reshape(len(given), len(given), -1)
+    # As a display shows them: of squared radiances a few highlights would be all that counts.
+    shown = np.clip(np.pi * btf.values.astype(np.float64), 0, 1) ** (1 / GAMMA)
+    values = shown.reshape(len(given), len(given), -1)
     with reproducible():
         weight = given.quadrature_weights
         gram = sum(

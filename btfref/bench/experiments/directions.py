@@ -78,13 +78,10 @@ def set_of(name: str, label: str) -> str | DirectionSet:
 
 
 def table(result: Facts) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Rows for people: a material and a set each, RMSE over the true values' RMS by footprint with 99 % intervals."""
+    """Rows for people: a material and a set each, errors of texels with 99 % intervals."""
     rows = []
     for name, sets in result["summary"].items():
         for label, found in sets.items():
-            cells = (
-                "{:.3f} ({:.3f} to {:.3f})".format(*facts["nrmse"]) for facts in found["errors"].values()
-            )
+            cells = offgrid.cells(found["errors"]["texel"])
             rows.append((name, label, str(found["directions"]), str(found["pictures"]), *cells))
-    heads = (f"RMSE / RMS, {footprint}" for footprint in offgrid.FOOTPRINTS)
-    return ("material", "set", "directions", "pictures", *heads), rows
+    return ("material", "set", "directions", "pictures", *offgrid.HEADS), rows

@@ -37,8 +37,8 @@ MAX_THETA = 85.0
 #: Footprints by name: half sides of squares, in texels of the fits.
 FOOTPRINTS = {"point": 0.0, "texel": 0.5, "4 x 4 texels": 2.0}
 
-#: Rows of each footprint, samples of each half of a row, and lookups that a method averages over a footprint. Highlights
-#: are rare: many rows of few samples say more than few rows of many.
+#: Rows of each footprint, samples of each half of a row, and lookups that a method averages over a footprint.
+#: Highlights are rare: many rows of few samples say more than few rows of many.
 ROWS, SPP, LOOKUPS = 20_000, 64, 4
 
 #: Rows where less is asked for.
@@ -168,17 +168,25 @@ COLUMNS = {
 }
 
 
+#: Heads of the columns.
+HEADS = tuple(head for head, _ in COLUMNS.values())
+
+
+def cells(facts: Facts) -> list[str]:
+    """Errors as a table shows them: 99 % intervals in brackets."""
+    found = []
+    for name, (_, form) in COLUMNS.items():
+        middle, low, high = (form.format(value) for value in facts[name])
+        found.append(f"{middle} ({low} to {high})")
+    return found
+
+
 def table(result: Facts) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Rows for people: a material, a set of directions, a method and a footprint each; 99 % intervals in brackets."""
-    rows = []
-    for label, made in result["summary"].items():
-        for key, footprints in made.items():
-            for footprint, facts in footprints.items():
-                cells = [_cell(facts[name], form) for name, (_, form) in COLUMNS.items()]
-                rows.append((label, key, footprint, *cells))
-    return ("material", "method", "footprint", *(head for head, _ in COLUMNS.values())), rows
-
-
-def _cell(values: list[float], form: str) -> str:
-    middle, low, high = (form.format(value) for value in values)
-    return f"{middle} ({low} to {high})"
+    """Rows for people: a material, a set of directions, a method and a footprint each."""
+    rows = [
+        (label, key, footprint, *cells(facts))
+        for label, made in result["summary"].items()
+        for key, footprints in made.items()
+        for footprint, facts in footprints.items()
+    ]
+    return ("material", "method", "footprint", *HEADS), rows
