@@ -167,8 +167,6 @@ def run(args: Namespace) -> int:
     job = make_job(args.mesostructure, settings, parameters)
     for line in job.mesostructure.ignored:
         sys.stderr.write(f"btfref: warning: ignored: {printable(line)}\n")
-    if not args.json:
-        emit(f"estimator: {job.attributes.get('fallback', job.settings.estimator)}")
     peak: list[int] = []
     with Progress() as progress:
         store = job.to_store(
@@ -185,6 +183,7 @@ def run(args: Namespace) -> int:
     if args.json:
         emit_json(info)
         return 0
+    emit(f"estimator: {job.attributes.get('fallback', job.settings.estimator)}")
     there = "" if info["complete"] else f", {info['coverage']:.1%} of it there"
     emit(f"{out}: {' × '.join(map(str, info['shape']))}, {bytes_text(info['file_bytes'])}{there}")
     emit(f"largest memory of a process: {bytes_text(peak[0])}")

@@ -85,7 +85,7 @@ def test_a_cluster_that_runs_elsewhere_is_reached_by_its_address(tmp_path, clust
 
 @pytest.mark.filterwarnings("default")
 def test_a_killed_worker_loses_nothing(tmp_path, cluster):
-    settings = SETTINGS | {"spp": 64, "texels": 32}
+    settings = SETTINGS | {"spp": 64, "texels": 32, "estimator": "path"}
     alone, shared = tmp_path / "alone.btf.zarr", tmp_path / "shared.btf.zarr"
     synthesize_store(alone, "checker", **settings)
     before = cluster.run(os.getpid)

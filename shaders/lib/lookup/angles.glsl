@@ -1,4 +1,5 @@
-// Provides angle_of: the angle of a 2D vector as a multiple of an eighth turn plus a small accurate remainder.
+// Provides angle_of: the angle of a 2D vector as a multiple of an eighth turn plus a small accurate remainder; and its
+// inverse on the unit circle, on_circle.
 // Expects nothing.
 
 struct Angle {
@@ -49,4 +50,16 @@ Angle angle_of(float y, float x) {
 // a - radians, without the rounding of a large sum.
 float angle_minus(Angle a, float radians) {
     return ((a.eighths * QUARTER_PI_HIGH - radians) + a.eighths * QUARTER_PI_LOW) + a.rest;
+}
+
+// (cos, sin) of a share of a whole turn, in [-1, 2]. Taylor series over an eighth turn to either side of a quarter: off by
+// 3e-8. Built-in sines may be off by 2^-11 (the precision that Vulkan asks for), which a ring multiplies.
+vec2 on_circle(float turns) {
+    float quarter = floor(4.0 * turns + 0.5);
+    float a = 6.28318530717958648 * (turns - 0.25 * quarter), z = a * a;
+    float s = a + a * z * (-1.0 / 6.0 + z * (1.0 / 120.0 + z * (-1.0 / 5040.0 + z / 362880.0)));
+    float c = 1.0 + z * (-0.5 + z * (1.0 / 24.0 + z * (-1.0 / 720.0 + z / 40320.0)));
+    float odd = quarter - 2.0 * floor(0.5 * quarter), half_turns = floor(0.5 * quarter);
+    vec2 at = odd > 0.5 ? vec2(-s, c) : vec2(c, s);
+    return half_turns - 2.0 * floor(0.5 * half_turns) > 0.5 ? -at : at;
 }

@@ -28,9 +28,9 @@ void ring_neighbours(vec4 ring, Angle azimuth, float share, out ivec2 index, out
     weight = share * vec2(1.0 - fraction, fraction);
 }
 
-// cos(turn i) - cos(turn k) as a product: near the axis, differences of cosines cancel.
-float corner_step(float turn, float i, float k) {
-    return 2.0 * sin(0.5 * turn * (i + k)) * sin(0.5 * turn * (k - i));
+// cos(i) - cos(k) of corners i and k as a product: near the axis, differences of cosines cancel.
+float corner_step(float count, float i, float k) {
+    return 2.0 * on_circle(0.5 * (i + k) / count).y * on_circle(0.5 * (k - i) / count).y;
 }
 
 // Inside a first ring that is no pole; inset is 1 - theta / theta_first. The ring's samples are the corners of a regular
@@ -43,18 +43,18 @@ Stencil cap_stencil(vec4 ring, Angle azimuth, float inset) {
     bool lower = first + fraction > 0.5 * count;
     first = lower ? count - 1.0 - first : first;
     fraction = lower ? 1.0 - fraction : fraction;
-    float a = turn * first, b = turn * (first + 1.0);
-    vec2 place = radius * mix(vec2(cos(a), sin(a)), vec2(cos(b), sin(b)), fraction);
+    vec2 place = radius * mix(on_circle(first / count), on_circle((first + 1.0) / count), fraction);
     // The built-in acos of Mesa is off by 1e-4, which would take the wrong corner.
     float x = clamp(place.x, -1.0, 1.0);
     Angle chord = angle_of(sqrt((1.0 - x) * (1.0 + x)), x);
     float position = (chord.eighths * QUARTER_PI_HIGH + chord.rest) / turn;
     float corner = clamp(floor(position), 0.0, max(floor(0.5 * count) - 1.0, 0.0));
-    float way = mix(corner_step(turn, corner, first), corner_step(turn, corner, first + 1.0), fraction);
-    way = inset * cos(turn * corner) + radius * way;
-    float width = corner_step(turn, corner, corner + 1.0);
+    float way = mix(corner_step(count, corner, first), corner_step(count, corner, first + 1.0), fraction);
+    vec2 at_corner = on_circle(corner / count);
+    way = inset * at_corner.x + radius * way;
+    float width = corner_step(count, corner, corner + 1.0);
     float along = width > 0.0 ? clamp(way / width, 0.0, 1.0) : 0.0;
-    float height = mix(sin(turn * corner), sin(turn * (corner + 1.0)), along);
+    float height = mix(at_corner.y, on_circle((corner + 1.0) / count).y, along);
     // 1e-30: at a corner on the axis the chord is a point, and any share of it will do.
     float far = clamp(0.5 - 0.5 * place.y / max(height, 1e-30), 0.0, 1.0);
     float below = lower ? 1.0 - far : far;

@@ -152,6 +152,7 @@ def test_a_terminated_command_leaves_nothing(tmp_path, need):
     need("llvm")
     out = tmp_path / "x.btf.zarr"
     command = ["synth", "checker", "-o", str(out), "--texels", "64", "--spp", "4096", "--views", "3x4"]
+    command += ["--estimator", "path"]
     child = subprocess.Popen(
         [sys.executable, "-m", "btfref", *command],
         stderr=subprocess.PIPE,
