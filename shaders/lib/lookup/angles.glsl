@@ -1,5 +1,5 @@
-// Provides angle_of: the angle of a 2D vector as a multiple of an eighth turn plus a small accurate remainder; and its
-// inverse on the unit circle, on_circle.
+// Provides angle_of: the angle of a 2D vector as a multiple of an eighth turn plus a small accurate remainder.
+// Provides on_circle: its inverse on the unit circle.
 // Expects nothing.
 
 struct Angle {
@@ -60,6 +60,6 @@ vec2 on_circle(float turns) {
     float s = a + a * z * (-1.0 / 6.0 + z * (1.0 / 120.0 + z * (-1.0 / 5040.0 + z / 362880.0)));
     float c = 1.0 + z * (-0.5 + z * (1.0 / 24.0 + z * (-1.0 / 720.0 + z / 40320.0)));
     float odd = quarter - 2.0 * floor(0.5 * quarter), half_turns = floor(0.5 * quarter);
-    vec2 at = odd > 0.5 ? vec2(-s, c) : vec2(c, s);
-    return half_turns - 2.0 * floor(0.5 * half_turns) > 0.5 ? -at : at;
+    float turned = 1.0 - 2.0 * (half_turns - 2.0 * floor(0.5 * half_turns));
+    return turned * mix(vec2(c, s), vec2(-s, c), odd);
 }
