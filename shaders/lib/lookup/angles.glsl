@@ -1,5 +1,4 @@
-// Provides angle_of: the angle of a 2D vector as a multiple of an eighth turn plus a small accurate remainder.
-// Provides on_circle: its inverse on the unit circle.
+// Provides angle_of, the angle of a 2D vector as eighths of a turn plus a small remainder, and its inverse on_circle.
 // Expects nothing.
 
 struct Angle {
