@@ -21,6 +21,7 @@ class StoredArray(Protocol):
     shards: tuple[int, ...] | None
     dtype: np.dtype
     oindex: Any
+    metadata: Any
 
     def __getitem__(self, selection: Any, /) -> np.ndarray: ...
 

@@ -7,14 +7,24 @@ each light.
 
 from __future__ import annotations
 
+import json
 import os
 import struct
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from btfref.sampling.store.layout import DRAFT
+
+if TYPE_CHECKING:
+    from btfref.sampling.store.arrays import StoredArray
+    from btfref.types import Facts
+
+#: Codecs of a chunk, and of a shard's index.
+_PLAIN = ["bytes", "crc32c"]
 
 #: Bytes of a checksum, CRC-32C.
 _SUM = 4
@@ -79,6 +89,32 @@ def write_chunk(path: Path, values: np.ndarray) -> None:
     """A chunk that is a file of its own; see `read_chunk`."""
     data = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
     write_bytes(path, data, checksum(data))
+
+
+def is_of_layout(array: StoredArray) -> bool:
+    """Whether an array's files are coded as `layout` does it: plain chunks with checksums, in shards for values.
+
+    Others, such as compressed ones that Zarr wrote elsewhere, are Zarr's to read.
+    """
+    facts = array.metadata.to_dict()
+    codecs = _named(facts["codecs"])
+    if codecs and codecs[0][0] == "sharding_indexed":
+        told = codecs[0][1]
+        inner = (
+            [name for name, _ in _named(told["codecs"])],
+            [name for name, _ in _named(told["index_codecs"])],
+        )
+        known = len(codecs) == 1 and inner == (_PLAIN, _PLAIN) and told.get("index_location", "end") == "end"
+    else:
+        known = [name for name, _ in codecs] == _PLAIN
+    big = '"big"' in json.dumps(facts["codecs"], default=str)
+    keys = facts["chunk_key_encoding"] == {"name": "default", "configuration": {"separator": "/"}}
+    alone = (array.shards or array.chunks)[0] == 1 and not facts.get("storage_transformers")
+    return known and keys and alone and not big
+
+
+def _named(codecs: Iterable[Any]) -> list[tuple[str, Facts]]:
+    return [(codec["name"], codec.get("configuration", {})) for codec in codecs]
 
 
 @dataclass

@@ -19,7 +19,7 @@ from btfref.outputs import refuse_existing, require_folder_of
 from btfref.sampling.store.arrays import Choice, StoredArray, along_axis
 from btfref.sampling.store.facts import store_facts
 from btfref.sampling.store.layout import DRAFT, TILE, attributes_of, check_finite, write_headers
-from btfref.sampling.store.shards import Shards, read_chunk, write_chunk
+from btfref.sampling.store.shards import Shards, is_of_layout, read_chunk, write_chunk
 
 if TYPE_CHECKING:
     from zarr.storage import StoreLike
@@ -140,7 +140,6 @@ class BTFStore:
         import zarr
 
         self.path = Path(path)
-        self._local = store is None
         self.attributes = attributes_of(self.path)
         self._group = self._guard("zarr.json", lambda: zarr.open_group(store or str(self.path), mode="r+"))
         self._values = self._array("values", 5)
@@ -175,6 +174,9 @@ class BTFStore:
             for name, array in (("values", self._values), ("variance", self._variance))
             if array is not None
         }
+        # Arrays that were coded elsewhere, or lie elsewhere, are Zarr's to read.
+        arrays = [array for array in (self._values, self._variance, self._coverage) if array is not None]
+        self._local = store is None and all(self._guard("codecs", partial(is_of_layout, a)) for a in arrays)
 
     def __repr__(self) -> str:
         kind = f"BTFStore {self.dtype}"
@@ -243,6 +245,8 @@ class BTFStore:
 
     def covered(self, view: int) -> np.ndarray:
         """Which parts of a view are there: bool, shape (lights, tile rows, tile columns)."""
+        if not self._local:
+            return self._guard("coverage", lambda: self._coverage[int(view)]) == 1
         marks = self._guard("coverage", partial(self._marks, int(view)))
         return np.zeros(self._coverage.shape[1:], bool) if marks is None else marks[0] == 1
 
@@ -321,6 +325,10 @@ class BTFStore:
         if (variance is not None) != self.has_variance:
             raise InputError(
                 "variance of a view", file=self.path, expected="given" if self.has_variance else "none"
+            )
+        if not self._local:
+            raise InputError(
+                "files that are coded otherwise can only be read", file=self.path, expected="a new store"
             )
         places = np.stack(tiles, 1)
         end = [min(n, (last + 1) * t) - o for n, last, t, o in zip(

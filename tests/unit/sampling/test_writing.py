@@ -143,3 +143,37 @@ def test_what_is_read_in_whole_views_is_what_zarr_reads(tmp_path, views):
     path.write_bytes(content)
     with pytest.raises(InputError, match="checksum"):
         open_store(store.path).read(views=1)
+
+
+@pytest.mark.parametrize("coded", ["compressed", "without shards", "big-endian"])
+def test_what_was_coded_elsewhere_is_read_by_zarr(tmp_path, views, coded):
+    """Compressed, unsharded or big-endian arrays hold the same values; nothing is added to them."""
+    path = tmp_path / "theirs.btf.zarr"
+    store = _store(path)
+    for view in (0, 1):
+        store.write_view(view, views[0][view], views[1][view])
+    expected, marks = store.read(views=slice(0, 2)), store.coverage
+    group = zarr.open_group(path)
+    for name, fill in (("values", float("nan")), ("variance", float("nan")), ("coverage", 0)):
+        data, chunks = group[name][:], group[name].chunks
+        shards = None if coded == "without shards" else group[name].shards
+        more = {"compressors": zarr.codecs.ZstdCodec()} if coded == "compressed" else {"compressors": None}
+        if coded == "big-endian":
+            more["serializer"] = zarr.codecs.BytesCodec(endian="big")
+        group.create_array(
+            name,
+            shape=data.shape,
+            dtype=data.dtype,
+            chunks=chunks,
+            shards=shards,
+            fill_value=fill,
+            overwrite=True,
+            **more,
+        )[:] = data
+    theirs = open_store(path)
+    assert np.array_equal(theirs.coverage, marks)
+    assert theirs.covered(0).all()
+    for ours, read in zip(expected, theirs.read(views=slice(0, 2)), strict=True):
+        assert np.array_equal(ours, read)
+    with pytest.raises(InputError, match="coded otherwise can only be read"):
+        theirs.write_view(2, views[0][0], views[1][0])
