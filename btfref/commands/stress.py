@@ -13,7 +13,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 
 from btfref.commands.shared.options import add_json, add_only, add_overwrite, add_seed, words
-from btfref.commands.shared.printing import Progress, emit, emit_json
+from btfref.commands.shared.printing import Progress, absent_line, emit, emit_json
 from btfref.commands.shared.reading import output_file
 from btfref.errors import InputError
 
@@ -82,5 +82,5 @@ def run(args: Namespace) -> int:
             "rounding of their arguments"
         )
         for name in result["parameters"]["absent"]:
-            emit(f"not run: {name}; this machine lacks what it needs (btfref doctor)")
+            emit(absent_line(name))
     return int(result["failures"] > 0)

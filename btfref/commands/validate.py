@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from btfref.commands.shared.options import add_json, add_only, words
-from btfref.commands.shared.printing import Progress, emit, emit_json, number, table
+from btfref.commands.shared.printing import Progress, absent_line, emit, emit_json, number, table
 from btfref.commands.shared.reading import count
 from btfref.errors import WORKERS
 
@@ -93,6 +93,8 @@ def lines(result: Validation) -> Iterator[str]:
     yield ""
     for name, gate in result.failed_gates:
         yield f"{name}: {gate.line}"
+    for name in result.facts.get("absent", ()):
+        yield absent_line(name)
     passed = sum(cell.outcome == "pass" for cell in result.cells)
     yield (
         f"{passed} of {len(result.cells)} cells pass; {additivity(result)}; "

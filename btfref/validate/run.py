@@ -132,6 +132,7 @@ def validate(
         When a process dies.
     """
     from btfref.provenance import versions
+    from btfref.stress.evaluators import PORTS, present
 
     specs = sorted(set(specs))
     if not specs:
@@ -164,7 +165,8 @@ def validate(
     of_methods = [result for result in results if isinstance(result, dict)]
     cells = sorted((c for r in of_methods for c in r.pop("cells")), key=lambda c: c.facts["name"])
     of_methods.sort(key=lambda m: (m["mesostructure"], m["method"]))
-    facts = {"versions": versions(), "workers": workers, "code": code}
+    absent = [name for name in PORTS if name not in present(PORTS)]
+    facts = {"versions": versions(), "workers": workers, "code": code, "absent": absent}
     return Validation(cells, of_methods, settings, time.perf_counter() - start, computed, total, facts)
 
 

@@ -104,6 +104,11 @@ class Progress:
         self._bar.update(done - self._bar.n)
 
 
+def absent_line(name: str) -> str:
+    """Why an evaluator took no part."""
+    return f"not run: {name}; this machine lacks what it needs (btfref doctor)"
+
+
 def table(rows: Iterable[Iterable[object]], *, header: Iterable[object] | None = None) -> list[str]:
     """Rows of cells as aligned lines; numbers to the right, text to the left."""
     body = [[str(cell) for cell in row] for row in rows]

@@ -1,11 +1,13 @@
-"""Code behind what is drawn with OpenGL: its hash holds the driver."""
+"""Code behind what is drawn with OpenGL or in a browser: its hash holds the driver and the browser."""
 
 from __future__ import annotations
 
 import json
+import subprocess
 from typing import TYPE_CHECKING
 
 from btfref.provenance import code
+from btfref.system import chromium
 from btfref.validate.cache import key_of
 
 if TYPE_CHECKING:
@@ -13,12 +15,12 @@ if TYPE_CHECKING:
 
 
 def code_of(root: str, *methods: str) -> str:
-    """`btfref.provenance.code.code_of`, and the OpenGL driver."""
+    """`btfref.provenance.code.code_of`, the OpenGL driver and the browser."""
     return key_of({"code": code.code_of(root, *methods), "driver": driver()})
 
 
 def driver() -> str:
-    """Vendor, renderer and version of the OpenGL driver, or why there is none; asked for once a run."""
+    """The OpenGL driver (vendor, renderer, version), or why there is none, and the browser; asked for once a run."""
     if not _told:
         _told.append(_asked())
     return _told[0]
@@ -33,9 +35,22 @@ def _asked() -> str:
     from btfref.rendering.gl import device
 
     try:
-        return json.dumps(device.facts(device.context()), sort_keys=True)
+        told = json.dumps(device.facts(device.context()), sort_keys=True)
     except MissingDependencyError as error:
-        return str(error)
+        told = str(error)
+    return f"{told}; {_browser()}"
+
+
+def _browser() -> str:
+    """What Chromium says of its version: what draws WebGL 2 comes with it."""
+    program = chromium()
+    if program is None:
+        return "no browser"
+    try:
+        said = subprocess.run([program, "--version"], capture_output=True, text=True, timeout=60, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"browser: {error}"
+    return said.stdout.strip()
 
 
 def found() -> Facts:

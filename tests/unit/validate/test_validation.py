@@ -13,6 +13,7 @@ import pytest
 from browser import browse
 from schemas import assert_follows_schema
 
+from btfref.commands.validate import lines
 from btfref.comparison.waterfall import Picture, waterfall
 from btfref.conventions import PixelClass
 from btfref.errors import InputError
@@ -27,6 +28,7 @@ from btfref.validate.cell import _save as save_cell
 from btfref.validate.material import material_key
 from btfref.validate.matrix import FULL, LIGHTS, MESOSTRUCTURES, QUICK, SCENES, Spec, select
 from btfref.validate.run import Validation
+from btfref.validate.stages import drawn
 from btfref.validate.stages.fits import fit_key
 from btfref.validate.summary import HEADER, rows
 
@@ -130,6 +132,29 @@ def test_what_code_made_that_changed_meanwhile_is_not_kept(tmp_path, monkeypatch
     store.get("key", ".txt", lambda path: path.write_text("1"))
     assert store.has("key", ".txt")  # it serves who made it
     assert not Cache(tmp_path).has("key", ".txt")
+
+
+def test_another_browser_makes_other_keys(tmp_path, monkeypatch):
+    """What WebGL 2 decided with one version, or without a browser, is not what it decides with another."""
+    monkeypatch.setattr("btfref.rendering.gl.device.context", lambda: None)
+    monkeypatch.setattr("btfref.rendering.gl.device.facts", lambda _: {})
+    program, told = tmp_path / "chromium", []
+    for version in (None, "156.0", "157.0"):
+        if version is not None:
+            program.write_text(f"#!/bin/sh\necho Chromium {version}\n")
+            program.chmod(0o755)
+        there = None if version is None else str(program)
+        monkeypatch.setattr("btfref.validate.stages.drawn.chromium", lambda there=there: there)
+        monkeypatch.setattr(drawn, "_told", [])
+        told.append(drawn.code_of("btfref.validate.cell"))
+    assert len(set(told)) == 3
+    assert drawn.driver().endswith("Chromium 157.0")
+
+
+def test_evaluators_that_took_no_part_are_named(monkeypatch):
+    result = Validation([], [], QUICK, facts={"absent": ["webgl"]})
+    assert [line for line in lines(result) if line.startswith("not run: webgl;")]
+    assert not [line for line in lines(Validation([], [], QUICK)) if line.startswith("not run")]
 
 
 def test_a_missing_reference_fails_every_gate():
