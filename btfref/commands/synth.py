@@ -22,7 +22,7 @@ from argparse import ArgumentParser, Namespace
 from typing import Any
 
 from btfref.commands.demand import add_scene_arguments, union, whole_shape
-from btfref.commands.shared.options import add_dtype, add_json, add_memory, add_seed
+from btfref.commands.shared.options import add_dtype, add_json, add_memory, add_seed, add_tracing
 from btfref.commands.shared.own_geometry import add_own_geometry, own_parameters
 from btfref.commands.shared.printing import Progress, bytes_text, emit, emit_json, printable
 from btfref.commands.shared.reading import (
@@ -32,7 +32,7 @@ from btfref.commands.shared.reading import (
     output_file,
     ranges,
 )
-from btfref.errors import INDICES, WORKERS, InputError
+from btfref.errors import INDICES, InputError
 from btfref.errors import SAMPLES as MANY_SAMPLES
 from btfref.sampling.settings import AUTO, ESTIMATORS, MOST_SAMPLES, SAMPLES, SynthesisSettings
 from btfref.types import Facts
@@ -124,20 +124,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "budget, e.g. 2G, of all processes together, or of each worker at an address (default: half of "
         "the machine's); without influence on the result",
     )
-    parser.add_argument(
-        "--scheduler",
-        metavar="dask|ADDRESS",
-        help="workers of a local Dask cluster, or of the one at tcp://HOST:PORT, whose workers see the same files",
-    )
-    parser.add_argument(
-        "--workers",
-        type=count(1, WORKERS),
-        metavar="N",
-        help="of the local cluster (default: one per two processors)",
-    )
-    parser.add_argument(
-        "--variant", default=default.variant, help="of Mitsuba (default %(default)s; cuda_ad_rgb)"
-    )
+    add_tracing(parser, default.variant)
     parser.add_argument("--overwrite", action="store_true", help="replace a store of other settings")
     add_json(parser, "the facts of the store")
 

@@ -92,7 +92,7 @@ def read_order(path: Path) -> QueryJob:
     """
     from btfref.querying.job import QueryJob
     from btfref.querying.settings import QuerySettings
-    from btfref.sampling.job_file import mesostructure_of, read_facts
+    from btfref.sampling.job_file import mesostructure_of, read_facts, refuse_other_versions
 
     try:
         data = read_facts(path)
@@ -101,13 +101,7 @@ def read_order(path: Path) -> QueryJob:
         if isinstance(error, InputError):
             raise
         raise InputError("not the job of queries", file=path, got=error) from error
-    if job.attributes["versions"] != data["versions"]:
-        raise InputError(
-            "a worker of another version",
-            field="versions",
-            got=job.attributes["versions"],
-            expected=data["versions"],
-        )
+    refuse_other_versions(job.attributes, data)
     return job
 
 

@@ -97,6 +97,17 @@ def read_facts(path: PathLike) -> Facts:
     return data
 
 
+def refuse_other_versions(attributes: Facts, told: Facts) -> None:
+    """InputError where a job was made with other versions than this process has."""
+    if attributes["versions"] != told["versions"]:
+        raise InputError(
+            "a worker of another version",
+            field="versions",
+            got=attributes["versions"],
+            expected=told["versions"],
+        )
+
+
 def read_job(path: PathLike) -> tuple[Job, Selection | None, Plan | None]:
     """The job of a file.
 
@@ -127,13 +138,7 @@ def read_job(path: PathLike) -> tuple[Job, Selection | None, Plan | None]:
             raise
         raise InputError("not the job of a synthesis", file=path, got=error) from error
     job = Job(mesostructure, {}, settings)
-    if job.attributes["versions"] != data["versions"]:
-        raise InputError(
-            "a worker of another version",
-            field="versions",
-            got=job.attributes["versions"],
-            expected=data["versions"],
-        )
+    refuse_other_versions(job.attributes, data)
     job.views, job.lights = (
         dataclasses.replace(directions, name=name)
         for directions, name in zip((job.views, job.lights), names, strict=True)

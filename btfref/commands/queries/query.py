@@ -20,12 +20,12 @@ from __future__ import annotations
 import sys
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 
-from btfref.commands.shared.options import add_json, add_seed
+from btfref.commands.shared.options import add_json, add_seed, add_tracing
 from btfref.commands.shared.own_geometry import add_own_geometry, own_parameters
 from btfref.commands.shared.printing import Progress, bytes_text, emit, emit_json, printable
 from btfref.commands.shared.reading import count, direction_set, number_above, output_file, size
 from btfref.errors import SAMPLES as MANY_SAMPLES
-from btfref.errors import WORKERS, InputError
+from btfref.errors import InputError
 from btfref.querying.settings import FOOTPRINTS, MOST_SPP, ROWS, SPP, QuerySettings
 
 #: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
@@ -117,20 +117,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         metavar="N",
         help="of the texture to train: base_radius (default 512)",
     )
-    parser.add_argument(
-        "--scheduler",
-        metavar="dask|ADDRESS",
-        help="workers of a local Dask cluster, or of the one at tcp://HOST:PORT, whose workers see the same files",
-    )
-    parser.add_argument(
-        "--workers",
-        type=count(1, WORKERS),
-        metavar="N",
-        help="of the local cluster (default: one per two processors)",
-    )
-    parser.add_argument(
-        "--variant", default=default.variant, help="of Mitsuba (default %(default)s; cuda_ad_rgb)"
-    )
+    add_tracing(parser, default.variant)
     parser.add_argument("--overwrite", action="store_true", help="replace queries of other settings")
     add_json(parser, "what was written")
 

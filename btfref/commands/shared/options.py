@@ -6,7 +6,7 @@ import textwrap
 from argparse import ArgumentParser, BooleanOptionalAction, _ActionsContainer
 
 from btfref.commands.shared.reading import count, memory_size, size
-from btfref.errors import GRID, SEED
+from btfref.errors import GRID, SEED, WORKERS
 from btfref.sampling.settings import DTYPES
 from btfref.scene.shipped import ENVIRONMENTS, described, lights, names
 
@@ -31,6 +31,22 @@ def add_image(parser: _ActionsContainer) -> None:
     parser.add_argument("--png", action="store_true", help="also write X.png, for eyes")
     add_overwrite(parser)
     add_size(parser)
+
+
+def add_tracing(parser: _ActionsContainer, variant: str) -> None:
+    """Where rays are traced: ``--scheduler``, ``--workers``, ``--variant``."""
+    parser.add_argument(
+        "--scheduler",
+        metavar="dask|ADDRESS",
+        help="workers of a local Dask cluster, or of the one at tcp://HOST:PORT, whose workers see the same files",
+    )
+    parser.add_argument(
+        "--workers",
+        type=count(1, WORKERS),
+        metavar="N",
+        help="of the local cluster (default: one per two processors)",
+    )
+    parser.add_argument("--variant", default=variant, help="of Mitsuba (default %(default)s; cuda_ad_rgb)")
 
 
 def add_overwrite(parser: _ActionsContainer) -> None:

@@ -21,7 +21,6 @@ number of attempts or on who works.
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -32,7 +31,7 @@ import numpy as np
 from btfref.conventions import COLOUR_SPACE, COSINE_CONVENTION, SCHEMA_VERSION, UNITS
 from btfref.errors import InputError
 from btfref.outputs import require_folder_of
-from btfref.sampling.store.layout import DRAFT
+from btfref.sampling.store.layout import lay_out_whole
 
 if TYPE_CHECKING:
     from btfref.sampling.store.arrays import StoredArray
@@ -284,16 +283,7 @@ def begin(
         if not overwrite or not _is_ours(path):
             raise problem
         shutil.rmtree(path)
-    draft = path.with_name(path.name + DRAFT)
-    shutil.rmtree(draft, ignore_errors=True)
-    try:
-        _lay_out(draft, n, wanted, min(chunk or CHUNK, n))
-        os.rename(draft, path)
-    except BaseException as error:
-        shutil.rmtree(draft, ignore_errors=True)
-        if isinstance(error, OSError) and error.errno is not None:
-            raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
-        raise
+    lay_out_whole(path, lambda draft: _lay_out(draft, n, wanted, min(chunk or CHUNK, n)))
     return QueryFile(path)
 
 

@@ -42,6 +42,8 @@ from btfref.conventions import AXES, COLOUR_SPACE, COSINE_CONVENTION, SCHEMA_VER
 from btfref.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from btfref.numerics.sphere.directions import DirectionSet
     from btfref.types import Facts, PathLike
 
@@ -227,6 +229,29 @@ def write_headers(
             fill_value=float("nan"),
         )
         array[:] = vectors
+
+
+def lay_out_whole(path: Path, lay_out: Callable[[Path], None]) -> None:
+    """A folder that appears under its name once `lay_out` has made all of it.
+
+    Parameters
+    ----------
+    path : Path
+        Does not exist.
+    lay_out : callable
+        ``lay_out(draft)`` fills another folder.
+    """
+    # A fixed name: what a killed run left is found and removed by the next one.
+    draft = path.with_name(path.name + DRAFT)
+    shutil.rmtree(draft, ignore_errors=True)
+    try:
+        lay_out(draft)
+        os.rename(draft, path)
+    except BaseException as error:
+        shutil.rmtree(draft, ignore_errors=True)
+        if isinstance(error, OSError) and error.errno is not None:
+            raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
+        raise
 
 
 def remove_leftovers(path: PathLike) -> None:

@@ -67,44 +67,22 @@ def write_bytes(path: Path, *parts: np.ndarray | bytes) -> None:
         raise
 
 
-def read_chunk(path: Path, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray | None:
-    """A chunk that is a file of its own, such as the coverage of a view; None where there is none.
-
-    Raises
-    ------
-    ValueError
-        A length or checksum that is wrong.
-    """
-    try:
-        data = np.fromfile(path, np.uint8)
-    except FileNotFoundError:
-        return None
-    size = dtype.itemsize * int(np.prod(shape))
-    if len(data) != size + _SUM or checksum(data[:size]) != data[size:].tobytes():
-        raise ValueError(f"length or checksum of {path.name}")
-    return data[:size].view(dtype).reshape(shape)
-
-
-def write_chunk(path: Path, values: np.ndarray) -> None:
-    """A chunk that is a file of its own; see `read_chunk`."""
-    data = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
-    write_bytes(path, data, checksum(data))
-
-
-def is_of_layout(array: StoredArray) -> bool:
+def is_of_layout(array: StoredArray, *, sharded: bool) -> bool:
     """Whether an array's files are coded as `layout` does it: plain chunks with checksums, in shards for values.
 
     Others, such as compressed ones that Zarr wrote elsewhere, are Zarr's to read.
     """
     facts = array.metadata.to_dict()
     codecs = _named(facts["codecs"])
-    if codecs and codecs[0][0] == "sharding_indexed":
+    if sharded:
+        if [name for name, _ in codecs] != ["sharding_indexed"]:
+            return False
         told = codecs[0][1]
         inner = (
             [name for name, _ in _named(told["codecs"])],
             [name for name, _ in _named(told["index_codecs"])],
         )
-        known = len(codecs) == 1 and inner == (_PLAIN, _PLAIN) and told.get("index_location", "end") == "end"
+        known = inner == (_PLAIN, _PLAIN) and told.get("index_location", "end") == "end"
     else:
         known = [name for name, _ in codecs] == _PLAIN
     big = '"big"' in json.dumps(facts["codecs"], default=str)
@@ -115,6 +93,52 @@ def is_of_layout(array: StoredArray) -> bool:
 
 def _named(codecs: Iterable[Any]) -> list[tuple[str, Facts]]:
     return [(codec["name"], codec.get("configuration", {})) for codec in codecs]
+
+
+@dataclass(frozen=True)
+class Marks:
+    """What is there of each view: a file a view, one chunk of uint8.
+
+    Attributes
+    ----------
+    folder : Path
+        Of the array.
+    shape : tuple of int
+        Lights, tile rows, tile columns.
+    """
+
+    folder: Path
+    shape: tuple[int, ...]
+
+    def read(self, view: int) -> np.ndarray:
+        """Marks of a view, 1 for what is there; 0 everywhere where nothing was written.
+
+        Raises
+        ------
+        ValueError
+            A length or checksum that is wrong.
+        """
+        path = self._path(view)
+        try:
+            data = np.fromfile(path, np.uint8)
+        except FileNotFoundError:
+            return np.zeros(self.shape, np.uint8)
+        size = int(np.prod(self.shape))
+        if len(data) != size + _SUM or checksum(data[:size]) != data[size:].tobytes():
+            raise ValueError(f"length or checksum of {path.name}")
+        return data[:size].reshape(self.shape)
+
+    def note(self, view: int, lights: np.ndarray, places: np.ndarray) -> None:
+        """Mark tiles of lights; a view that is there whole is marked without a look at its marks."""
+        whole = len(lights) * len(places) == np.prod(self.shape)
+        marks = np.zeros(self.shape, np.uint8) if whole else self.read(view)
+        for row, column in places:
+            marks[lights, row, column] = 1
+        data = marks.reshape(-1)
+        write_bytes(self._path(view), data, checksum(data))
+
+    def _path(self, view: int) -> Path:
+        return self.folder.joinpath("c", str(view), "0", "0", "0")
 
 
 @dataclass

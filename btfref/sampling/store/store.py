@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -18,8 +17,8 @@ from btfref.numerics.sphere.directions import checked
 from btfref.outputs import refuse_existing, require_folder_of
 from btfref.sampling.store.arrays import Choice, StoredArray, along_axis
 from btfref.sampling.store.facts import store_facts
-from btfref.sampling.store.layout import DRAFT, TILE, attributes_of, check_finite, write_headers
-from btfref.sampling.store.shards import Shards, is_of_layout, read_chunk, write_chunk
+from btfref.sampling.store.layout import TILE, attributes_of, check_finite, lay_out_whole, write_headers
+from btfref.sampling.store.shards import Marks, Shards, is_of_layout
 
 if TYPE_CHECKING:
     from zarr.storage import StoreLike
@@ -87,17 +86,8 @@ def create_store(
     path = Path(path)
     refuse_existing(path)
     require_folder_of(path)
-    # A fixed name: what a killed run left is found and removed by the next one.
-    draft = path.with_name(path.name + DRAFT)
-    shutil.rmtree(draft, ignore_errors=True)
-    try:
-        write_headers(draft, views, lights, texels, dtype, variance, tile, attributes, adaptive)
-        os.rename(draft, path)
-    except BaseException as error:
-        shutil.rmtree(draft, ignore_errors=True)
-        if isinstance(error, OSError) and error.errno is not None:
-            raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
-        raise
+    headers = (views, lights, texels, dtype, variance, tile, attributes, adaptive)
+    lay_out_whole(path, lambda draft: write_headers(draft, *headers))
     return BTFStore(path)
 
 
@@ -174,9 +164,14 @@ class BTFStore:
             for name, array in (("values", self._values), ("variance", self._variance))
             if array is not None
         }
+        self._marks = Marks(self.path / "coverage", self._coverage.shape[1:])
         # Arrays that were coded elsewhere, or lie elsewhere, are Zarr's to read.
-        arrays = [array for array in (self._values, self._variance, self._coverage) if array is not None]
-        self._local = store is None and all(self._guard("codecs", partial(is_of_layout, a)) for a in arrays)
+        arrays = [(self._values, True), (self._variance, True), (self._coverage, False)]
+        self._local = store is None and all(
+            self._guard("codecs", partial(is_of_layout, array, sharded=sharded))
+            for array, sharded in arrays
+            if array is not None
+        )
 
     def __repr__(self) -> str:
         kind = f"BTFStore {self.dtype}"
@@ -247,8 +242,7 @@ class BTFStore:
         """Which parts of a view are there: bool, shape (lights, tile rows, tile columns)."""
         if not self._local:
             return self._guard("coverage", lambda: self._coverage[int(view)]) == 1
-        marks = self._guard("coverage", partial(self._marks, int(view)))
-        return np.zeros(self._coverage.shape[1:], bool) if marks is None else marks[0] == 1
+        return self._guard("coverage", lambda: self._marks.read(int(view))) == 1
 
     def write_map(self, name: str, view: int, values: np.ndarray) -> None:
         """Write a view of an array that `maps` gives."""
@@ -347,7 +341,7 @@ class BTFStore:
                 )
             self._check(array, places, origin, shards.dtype, field)
             self._write_shards(shards, field, int(view), np.asarray(lights), places, array, origin)
-        self._guard("coverage", lambda: self._mark(int(view), lights, places))
+        self._guard("coverage", lambda: self._marks.note(int(view), lights, places))
 
     def _check(
         self, array: np.ndarray, places: np.ndarray, origin: tuple[int, int], dtype: np.dtype, field: str
@@ -386,22 +380,6 @@ class BTFStore:
                 start = [o - k * t for o, k, t in zip(origin, corner.tolist(), self.tile, strict=True)]
                 arguments = (lights[mine] % n_lights, inside, some, (start[0], start[1]))
                 self._guard(field, partial(shards.write, view, (int(part), row, column), *arguments))
-
-    def _mark(self, view: int, lights: np.ndarray, places: np.ndarray) -> None:
-        """Note what is there of a view; a view that is written whole is marked without a look at its marks."""
-        shape = (1, *self._coverage.shape[1:])
-        there = self._marks(view) if len(lights) * len(places) < np.prod(shape) else None
-        marks = np.zeros(shape, np.uint8) if there is None else there.copy()
-        for row, column in places:
-            marks[0, lights, row, column] = 1
-        write_chunk(self._marks_file(view), marks)
-
-    def _marks_file(self, view: int) -> Path:
-        return self.path.joinpath("coverage", "c", str(view), "0", "0", "0")
-
-    def _marks(self, view: int) -> np.ndarray | None:
-        """What the file of a view's coverage holds; None where nothing was written."""
-        return read_chunk(self._marks_file(view), np.dtype(np.uint8), (1, *self._coverage.shape[1:]))
 
     def read(
         self,
