@@ -60,11 +60,11 @@ def texels(n, w_light, w_view):
 )
 def test_rows_agree_with_plain_renders(llvm, name, pairs):
     """Texels as square footprints, at pairs of directions on no grid; every second one is oblique."""
-    tile = build(name, resolution=32)
+    tile = build(name, **({"resolution": 32} if name == "checker" else {}))
     rng = np.random.default_rng(17)
     counts = {"spp": 64, "rounds": 6} if pairs < 10 else {"spp": 512, "rounds": 20}
     plain = PlainRenders(llvm, tile, texels=4, reach=3, max_depth=8)
-    p = []
+    p, means = [], []
     for k in range(pairs):
         theta = np.radians([20 + 40 * (k % 2) + 10 * rng.random(), 60 * rng.random()])
         view, light = spherical(theta, 2 * np.pi * rng.random(2))
@@ -78,11 +78,12 @@ def test_rows_agree_with_plain_renders(llvm, name, pairs):
         )
         assert other.mean() > 0
         p.append(found)
+        means.append(mean)
     verdict = difference_test(np.array(p), significance=tolerance("queries.z.significance"))
     assert verdict.rejected == 0
-    # The next pair's values are seen to be others.
+    # Values of the pair before are seen to be others.
     _, wrong = welch_test(
-        mean[::-1], variance + scale**2, other.reshape(shape), spread.reshape(shape), n_b=counts["rounds"]
+        means[-2], variance + scale**2, other.reshape(shape), spread.reshape(shape), n_b=counts["rounds"]
     )
     assert difference_test(wrong, significance=tolerance("queries.z.significance")).rejected > 0
 
