@@ -179,6 +179,18 @@ def evaluator(need):
         _free()
 
 
+@pytest.fixture(scope="module")
+def coarse_environments():
+    """A quarter of the cells that stand for an environment: for tests whose two sides are made of the same ones."""
+    from btfref.rendering.environment_light import harmonic_light
+    from btfref.scene import environment
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (environment, harmonic_light):
+            patch.setattr(module, "CELL_ROWS", module.CELL_ROWS // 2)
+        yield
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _free_jit_state():
     """No array of one test module keeps memory, or leaves pending work, for the next."""

@@ -100,7 +100,7 @@ class Environment:
         lower = (1 - fx) * texel(r0 + 1, c0) + fx * texel(r0 + 1, c1)
         return (1 - fy) * upper + fy * lower
 
-    def cells(self, rows: int = CELL_ROWS) -> tuple[np.ndarray, np.ndarray]:
+    def cells(self, rows: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """The environment as a few thousand small lights.
 
         The interpolated radiance is integrated over cells of equal angles; each light stands at the luminance's
@@ -108,8 +108,8 @@ class Environment:
 
         Parameters
         ----------
-        rows : int
-            Of cells; there are twice as many columns.
+        rows : int, optional
+            Of cells; there are twice as many columns. By default `CELL_ROWS`.
 
         Returns
         -------
@@ -119,6 +119,7 @@ class Environment:
             Radiance times solid angle: irradiance perpendicular to ``w``. Sums over the sphere are exact for
             a constant environment.
         """
+        rows = rows or CELL_ROWS
         height, width = self.radiance.shape[:2]
         # Breakpoints of the bilinear interpolant fall on borders of the fine grid, where the rule is of second order.
         n_v = (height - 1) * max(2, -(-2 * rows // (height - 1)))
@@ -153,8 +154,9 @@ class Environment:
         return centre @ self.to_world.T, power
 
 
-def cell_angles(rows: int = CELL_ROWS) -> np.ndarray:
+def cell_angles(rows: int | None = None) -> np.ndarray:
     """Solid angles of the cells of :meth:`Environment.cells`, shape (2 rows²,)."""
+    rows = rows or CELL_ROWS
     border = np.cos(np.arange(rows + 1) * (np.pi / rows))
     return np.repeat((border[:-1] - border[1:]) * (np.pi / rows), 2 * rows)
 

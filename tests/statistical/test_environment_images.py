@@ -23,7 +23,7 @@ from btfref.scene.loading import loaded
 from btfref.scene.pixel_classes import pixel_classes
 from btfref.scene.shipped import scene_file
 
-pytestmark = pytest.mark.usefixtures("renderers")
+pytestmark = pytest.mark.usefixtures("renderers", "coarse_environments")
 
 SCENES = ("plane", "sphere", "cloth")
 ENVIRONMENTS = ("constant", "sky", "studio", "bright-texel")

@@ -20,7 +20,7 @@ from btfref.rendering.offline.approximate import approximate
 from btfref.scene.pixel_classes import pixel_classes
 from btfref.scene.shipped import scene_file
 
-pytestmark = pytest.mark.usefixtures("renderers")
+pytestmark = pytest.mark.usefixtures("renderers", "coarse_environments")
 
 SIZE = (20, 20)
 SCENES = ("plane", "sphere", "cloth")

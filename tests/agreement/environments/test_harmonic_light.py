@@ -19,6 +19,8 @@ from btfref.scene.environments import harmonic_environment, shipped
 from btfref.scene.pixel_classes import pixel_classes
 from btfref.scene.shipped import scene_file
 
+pytestmark = pytest.mark.usefixtures("coarse_environments")
+
 
 def lookups(rng, n, *, mirrored=True):
     frame = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]

@@ -28,6 +28,8 @@ from btfref.scene.environment import Environment, bright_texel, constant
 from btfref.scene.environments import studio
 from btfref.scene.pixel_classes import pixel_classes
 
+pytestmark = pytest.mark.usefixtures("coarse_environments")
+
 KEYS = [key for key, row in methods().items() if row.image_light]
 SPHERE = files("btfref.scene.shipped").joinpath("sphere.xml")
 SIZE = (48, 48)

@@ -17,6 +17,8 @@ from btfref.scene.environment import Environment, bright_texel, constant
 from btfref.scene.pixel_classes import pixel_classes
 from btfref.scene.shipped import scene_file
 
+pytestmark = pytest.mark.usefixtures("coarse_environments")
+
 SIZE = (32, 32)
 
 

@@ -29,7 +29,7 @@ from btfref.scene.pixel_classes import pixel_classes
 from btfref.scene.shapes import neighbours
 from btfref.scene.shipped import scene_file
 
-pytestmark = pytest.mark.usefixtures("renderers")
+pytestmark = pytest.mark.usefixtures("renderers", "coarse_environments")
 
 SIZE = (32, 32)
 SUM = tolerance("rendered.sum.rtol")

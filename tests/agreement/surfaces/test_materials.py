@@ -20,7 +20,7 @@ from btfref.scene.description import read_scene
 from btfref.scene.pixel_classes import pixel_classes
 from btfref.scene.surfaces.materials import PlainMaterial
 
-pytestmark = pytest.mark.usefixtures("renderers")
+pytestmark = pytest.mark.usefixtures("renderers", "coarse_environments")
 
 GATES = ("image.noise_free", "image.silhouette", "image.background")
 

@@ -8,6 +8,8 @@ from btfref.rendering.environment_light.split_light import MOST, TARGET, split_l
 from btfref.scene.environment import Environment, bright_texel, cell_angles, constant
 from btfref.scene.environments import studio
 
+pytestmark = pytest.mark.usefixtures("coarse_environments")
+
 #: Cosine of the outermost ring of the usual 81 directions.
 EDGE = np.cos(np.radians(75))
 POWER = tolerance("split_light.power")
