@@ -1,5 +1,6 @@
 """What all tests share: requirements, floating-point errors, Dr.Jit state and reference data."""
 
+import functools
 import gc
 import importlib.util
 import os
@@ -33,7 +34,9 @@ CAPABILITIES = {
 }
 
 
+@functools.cache
 def _llvm():
+    """Path of the library that Dr.Jit is to load (looked for once: it takes 20 ms)."""
     from btfref.errors import MissingDependencyError
     from btfref.platform import prepare_llvm
 

@@ -14,14 +14,19 @@ class PlainRenders:
         self.mi, self.texels = mi, texels
         self.shapes = merged(mi, mesostructure, reach)
         self.integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
-        self.scenes, self.cameras = {}, {}
+        self.cameras = {}
+        emitter = {"type": "directional", "irradiance": 1.0}
+        self._scene = mi.load_dict({"type": "scene", "light": emitter, **self.shapes})
+        self._parameters = mi.traverse(self._scene)
 
     def scene(self, light):
-        key = tuple(light)
-        if key not in self.scenes:
-            emitter = {"type": "directional", "direction": [-float(x) for x in light], "irradiance": 1.0}
-            self.scenes[key] = self.mi.load_dict({"type": "scene", "light": emitter, **self.shapes})
-        return self.scenes[key]
+        """The scene under this light; its tree of triangles is built once for all lights."""
+        light = np.asarray(light, float)
+        up = np.eye(3)[np.argmin(np.abs(light))].tolist()
+        towards = self.mi.ScalarTransform4f().look_at(origin=[0, 0, 0], target=(-light).tolist(), up=up)
+        self._parameters["light.to_world"] = self.mi.Transform4f(towards)
+        self._parameters.update()
+        return self._scene
 
     def pair(self, view, light, *, spp, rounds, seed):
         """(texels, texels, 3) mean and variance of the mean from `rounds` renders of `spp` samples each."""
