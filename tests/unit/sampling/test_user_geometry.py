@@ -5,16 +5,14 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
+from user_files import FACES, SQUARE, grid, texture, write_obj
 
 from btfref.cli import main
 from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
-from btfref.mesostructure import Mesostructure, Part, build
+from btfref.mesostructure import build
 from btfref.mesostructure.materials import bsdf_from_xml, load_bsdf
 from btfref.mesostructure.seams import mesh_seams, open_edges
-
-SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-FACES = np.array([[0, 1, 2], [0, 2, 3]])
 
 
 def _waves(n, periods=(1, 1)):
@@ -37,21 +35,6 @@ def _exr(path, values):
     with OpenEXR.File(header, {"Y": values.astype(np.float32)}) as file:
         file.write(str(path))
     return str(path)
-
-
-def _texture(n=8):
-    """An image without any symmetry: row and column are in its colours."""
-    row, column = np.mgrid[0:n, 0:n]
-    return np.stack([30 + 25 * row, 30 + 25 * column, np.full_like(row, 60)], -1).astype(np.uint8)
-
-
-def _grid(n, height):
-    """Vertices (tile units) and faces of a height field over the closed unit square."""
-    x, y = np.meshgrid(np.arange(n + 1) / n, np.arange(n + 1) / n)
-    corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
-    quads = np.stack([corner, corner + 1, corner + n + 2, corner + n + 1], 1)
-    faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    return np.stack([x, y, height(x, y)], -1).reshape(-1, 3), faces
 
 
 # --- height maps
@@ -108,7 +91,7 @@ def test_a_periodic_map_with_steps_is_taken(tmp_path):
 
 def test_albedo_and_roughness_maps_reach_the_material(tmp_path, llvm):
     height = _png16(tmp_path / "h.png", _waves(8))
-    Image.fromarray(_texture()).save(tmp_path / "a.png")
+    Image.fromarray(texture()).save(tmp_path / "a.png")
     rough = np.linspace(0.2, 0.9, 64).reshape(8, 8)
     settings = {"albedo": str(tmp_path / "a.png"), "roughness": _exr(tmp_path / "r.exr", rough)}
     with pytest.raises(InputError, match="does not tile: roughness"):
@@ -121,22 +104,12 @@ def test_albedo_and_roughness_maps_reach_the_material(tmp_path, llvm):
     column, row = np.meshgrid(np.arange(8), np.arange(8))
     si.uv = mi.Point2f(((column + 0.5) / 8).ravel(), ((row + 0.5) / 8).ravel())
     got = np.array(load_bsdf(lambert).eval_diffuse_reflectance(si)).T.reshape(8, 8, 3)
-    encoded = _texture() / 255
+    encoded = texture() / 255
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     assert np.abs(got - linear).max() <= tolerance("mesostructure.texture")
 
 
 # --- meshes
-
-
-def _write_obj(folder, name="m.obj", kd="1 1 1", vertices=SQUARE, faces=FACES, uv=None):
-    Image.fromarray(_texture()).save(folder / "t.png")
-    (folder / "m.mtl").write_text(f"newmtl a\nKd {kd}\nmap_Kd t.png\n")
-    uv = vertices[:, :2] if uv is None else uv
-    lines = ["mtllib m.mtl", *(f"v {x} {y} {z}" for x, y, z in vertices), *(f"vt {u} {v}" for u, v in uv)]
-    lines += ["usemtl a", *("f " + " ".join(f"{k + 1}/{k + 1}" for k in face) for face in faces)]
-    (folder / name).write_text("\n".join(lines) + "\n")
-    return folder / name
 
 
 def _colours(mi, part, xy):
@@ -159,24 +132,24 @@ def test_textures_of_obj_and_glb_lie_where_mitsuba_and_gltf_put_them(tmp_path, l
     """Image row 0 is at v = 1 of an OBJ file, whose v points up; a GLB made of it shows the same."""
     import trimesh
 
-    file = _write_obj(tmp_path)
+    file = write_obj(tmp_path)
     settings = {"up": "z"}
     if suffix == ".glb":
         scene = trimesh.load_scene(file, process=False)
         (geometry,) = scene.geometry.values()
-        image = Image.fromarray(_texture())
+        image = Image.fromarray(texture())
         geometry.visual.material = trimesh.visual.material.PBRMaterial(
             baseColorTexture=image, metallicFactor=0.0, roughnessFactor=0.5
         )
         file = tmp_path / "m.glb"
         scene.export(file)
         vertices = SQUARE @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
-        lying = _write_obj(tmp_path, "lying.obj", vertices=vertices, uv=SQUARE[:, :2])
+        lying = write_obj(tmp_path, "lying.obj", vertices=vertices, uv=SQUARE[:, :2])
         assert build(lying, up="y").parts[0].vertices == pytest.approx(
             build(tmp_path / "m.obj").parts[0].vertices
         )
     (part,) = build(file, **settings).parts
-    encoded = _texture()[::-1].reshape(-1, 3) / 255
+    encoded = texture()[::-1].reshape(-1, 3) / 255
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     got = _colours(llvm, part, CENTRES)
     if suffix == ".obj":
@@ -202,8 +175,8 @@ def test_textures_of_obj_and_glb_lie_where_mitsuba_and_gltf_put_them(tmp_path, l
 
 
 def test_factors_multiply_textures(tmp_path, llvm):
-    one = _colours(llvm, build(_write_obj(tmp_path)).parts[0], CENTRES)
-    scaled = _colours(llvm, build(_write_obj(tmp_path, kd="0.5 0.25 1")).parts[0], CENTRES)
+    one = _colours(llvm, build(write_obj(tmp_path)).parts[0], CENTRES)
+    scaled = _colours(llvm, build(write_obj(tmp_path, kd="0.5 0.25 1")).parts[0], CENTRES)
     assert np.abs(scaled - one * [0.5, 0.25, 1]).max() <= tolerance("mesostructure.texture")
 
 
@@ -215,9 +188,9 @@ XML = """<scene version="3.0.0"><bsdf type="twosided"><bsdf type="principled">
 
 def test_a_material_from_xml_is_mitsubas_own(tmp_path, llvm):
     (tmp_path / "maps").mkdir()
-    Image.fromarray(_texture()).save(tmp_path / "maps" / "t.png")
+    Image.fromarray(texture()).save(tmp_path / "maps" / "t.png")
     (tmp_path / "b.xml").write_text(XML)
-    file = _write_obj(tmp_path)
+    file = write_obj(tmp_path)
     (part,) = build(file, bsdf=str(tmp_path / "b.xml")).parts
     json.dumps(part.bsdf)
     rng = np.random.default_rng(0)
@@ -256,8 +229,8 @@ def test_a_bad_material_is_one_clear_line(tmp_path, text, message):
 
 
 def test_a_tile_of_a_larger_mesh_in_other_units(tmp_path):
-    vertices, faces = _grid(8, lambda x, y: 0.1 * np.cos(2 * np.pi * x))
-    file = _write_obj(tmp_path, vertices=vertices * 40 + [10, -30, 7], faces=faces, uv=vertices[:, :2])
+    vertices, faces = grid(8, lambda x, y: 0.1 * np.cos(2 * np.pi * x))
+    file = write_obj(tmp_path, vertices=vertices * 40 + [10, -30, 7], faces=faces, uv=vertices[:, :2])
     with pytest.raises(InputError, match=r"bounds in x are 10 … 50 .* `tile`"):
         build(file)
     for tile in ((10, -30, 50, 10), "bounds"):
@@ -273,7 +246,7 @@ def test_a_tile_of_a_larger_mesh_in_other_units(tmp_path):
 def test_shading_normals_are_those_of_the_file(tmp_path, suffix):
     import trimesh
 
-    vertices, faces = _grid(4, lambda x, y: 0.1 * np.cos(2 * np.pi * x))
+    vertices, faces = grid(4, lambda x, y: 0.1 * np.cos(2 * np.pi * x))
     normals = np.stack([vertices[:, 1] - 0.5, vertices[:, 0] - 0.5, np.ones(len(vertices))], -1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     file = tmp_path / f"m{suffix}"
@@ -290,19 +263,19 @@ def test_shading_normals_are_those_of_the_file(tmp_path, suffix):
 
 def test_borders_that_meet_have_no_seam():
     for height in (lambda x, y: 0 * x, lambda x, y: 0.1 * np.sin(2 * np.pi * (x + 2 * y))):
-        assert not mesh_seams(*_grid(8, height))
+        assert not mesh_seams(*grid(8, height))
     assert not len(open_edges(SQUARE, FACES))
     tissue = build("tissue")
     assert not mesh_seams(tissue.parts[0].vertices, tissue.parts[0].faces)
     # Other triangles on the other side, but the same border.
-    vertices, faces = _grid(8, lambda x, y: 0 * x)
+    vertices, faces = grid(8, lambda x, y: 0 * x)
     vertices[(vertices[:, 0] == 1) & (vertices[:, 1] > 0) & (vertices[:, 1] < 1), 1] += 0.01
     assert len(open_edges(vertices, faces))
     assert not mesh_seams(vertices, faces)
 
 
 def test_a_gap_is_measured_and_placed():
-    vertices, faces = _grid(10, lambda x, y: 0.03 * x * np.exp(-8 * np.sin(np.pi * (y - 0.3)) ** 2))
+    vertices, faces = grid(10, lambda x, y: 0.03 * x * np.exp(-8 * np.sin(np.pi * (y - 0.3)) ** 2))
     (seam,) = mesh_seams(vertices, faces)
     assert seam.gap == pytest.approx(0.03, rel=tolerance("mesostructure.gap"))
     assert "x = 0 and x = 1" in seam.what
@@ -310,14 +283,14 @@ def test_a_gap_is_measured_and_placed():
 
 
 def test_a_hole_is_an_open_border():
-    vertices, faces = _grid(8, lambda x, y: 0 * x)
+    vertices, faces = grid(8, lambda x, y: 0 * x)
     (seam,) = mesh_seams(vertices, faces[np.arange(len(faces)) != 27])
     assert "open borders inside the tile: 3 edges" in seam.what
 
 
 def test_a_mesh_too_small_for_its_tile_is_reported(tmp_path):
-    vertices, faces = _grid(8, lambda x, y: 0 * x)
-    file = _write_obj(tmp_path, vertices=vertices * 0.9, faces=faces, uv=vertices[:, :2])
+    vertices, faces = grid(8, lambda x, y: 0 * x)
+    file = write_obj(tmp_path, vertices=vertices * 0.9, faces=faces, uv=vertices[:, :2])
     with pytest.raises(InputError, match=r"x = 0 and x = 0\.9 are 0\.1 tiles apart"):
         build(file)
     assert build(file, allow_seams=True).parts
@@ -347,7 +320,7 @@ def test_the_command_line_takes_files(tmp_path, llvm, capsys):
     assert message.count("\n") == 1
     assert not other.exists()
     assert main(["synth", ramp, "-o", str(other), "--allow-seams", *small]) == 0
-    mesh = _write_obj(tmp_path)
+    mesh = write_obj(tmp_path)
     (tmp_path / "b.xml").write_text(
         '<bsdf version="3.0.0" type="roughconductor"><float name="alpha" value="0.3"/></bsdf>'
     )
@@ -375,7 +348,7 @@ def test_a_textured_mesh_is_synthesized_alike_by_both_estimators(tmp_path, llvm)
     import btfref
 
     settings = {"texels": 8, "views": "1x3", "lights": "1x3", "dtype": "float32"}
-    file = _write_obj(tmp_path)
+    file = write_obj(tmp_path)
     path, surface = (
         btfref.synthesize(str(file), spp=64, estimator=name, **settings) for name in ("path", "surface")
     )
@@ -385,124 +358,3 @@ def test_a_textured_mesh_is_synthesized_alike_by_both_estimators(tmp_path, llvm)
     assert np.abs(surface.values - path.values).mean() / path.values.mean() <= tolerance(
         "mesostructure.textured"
     )
-
-
-# --- geometry that is missing, or shows its back
-
-PLAIN = '<bsdf version="3.0.0" type="{}"/>'
-
-
-def _bare(folder, lines, name="bare.obj"):
-    (folder / name).write_text("\n".join(lines) + "\n")
-    return folder / name
-
-
-def _material(folder, text='<bsdf version="3.0.0" type="diffuse"/>'):
-    (folder / "plain.xml").write_text(text)
-    return {"bsdf": str(folder / "plain.xml")}
-
-
-def _corners(low, high):
-    return [f"v {x} {y} 0" for x, y in ((low, 0), (high, 0), (high, 1), (low, 1))]
-
-
-def test_faces_that_lie_on_each_other_do_not_close_a_tile(tmp_path):
-    file = _bare(tmp_path, [*_corners(0.25, 1), "f 1 2 3 4", "f 4 3 2 1"])
-    with pytest.raises(
-        InputError, match=r"no surface over a part of the tile.*0\.25 of its area.*x = 0 … 0\.25"
-    ) as error:
-        build(file, **_material(tmp_path))
-    assert "faces lie over each other, in all 1.5 tiles" in str(error.value)
-    assert "\n" not in str(error.value)
-    assert build(file, allow_seams=True, **_material(tmp_path)).parts
-    walls = _bare(
-        tmp_path,
-        ["v 0.5 0 0", "v 0.5 1 0", "v 0.5 1 -1", "v 0.5 0 -1", "v 1.5 0 0", "f 1 2 3 4", "f 1 4 3 2"],
-    )
-    with pytest.raises(InputError, match=r"1 of its area empty|do not fit the unit tile"):
-        build(walls, **_material(tmp_path))
-
-
-def test_closed_geometry_between_gaps_and_across_the_border_is_measured(tmp_path):
-    from btfref.mesostructure.coverage import topmost
-
-    vertices, faces = _grid(8, lambda x, y: 0.1 * np.sin(2 * np.pi * x))
-    for move in ([0, 0, 0], [0.37, -0.61, 0]):
-        face, z = topmost(vertices + move, faces)
-        assert (face >= 0).all()
-        # Heights of the facets at the places, which stand at equal steps.
-        x = (np.arange(64) + 0.4871) / 64 - move[0]
-        exact = np.interp(x, np.arange(9) / 8, 0.1 * np.sin(np.pi / 4 * np.arange(9)), period=1)
-        assert np.abs(z - exact).max() <= tolerance("mesostructure.units")
-    face, _ = topmost(vertices, faces[vertices[faces][:, :, 0].max(1) <= 0.5])
-    assert (face[:, :32] >= 0).all()
-    assert (face[:, 32:] < 0).all()
-
-
-def test_indices_that_count_back_are_read_where_they_stand(tmp_path):
-    """Between the vertices that they count: a reader that waits for the end of the file reads one face twice."""
-    face = "f -4/-4 -3/-3 -2/-2 -1/-1"
-    uv = ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
-    lines = [*_corners(0, 0.5), *uv, face, *_corners(0.5, 1), *[t.replace("1", "0.5") for t in uv], face]
-    (part,) = build(_bare(tmp_path, lines), **_material(tmp_path)).parts
-    middles = part.vertices[part.faces].mean(1)
-    right = middles[:, 0] > 0.5
-    assert sorted(right.tolist()) == [False, False, True, True]
-    assert part.uv[part.faces][right][..., 0].max() == 0.5
-    with pytest.raises(InputError, match="'line 5'; got -9; expected at least -4"):
-        build(_bare(tmp_path, [*_corners(0, 1), "f -9 -3 -2"]), **_material(tmp_path))
-
-
-@pytest.mark.parametrize("estimator", ["path", "surface"])
-def test_faces_without_area_are_no_obstacle(tmp_path, llvm, estimator):
-    import btfref
-
-    file = _bare(tmp_path, [*_corners(0, 1), "v 0.5 0.5 0", "f 1 2 3 4", "f 1 1 2", "f 1 5 3"])
-    settings = {
-        "texels": 2,
-        "views": "1x3",
-        "lights": "1x3",
-        "spp": 8,
-        "estimator": estimator,
-        "dtype": "float32",
-    }
-    values = btfref.synthesize(file, **_material(tmp_path), **settings).values
-    whole = btfref.synthesize("flat", **settings).values
-    assert np.abs(values - whole).max() / whole.max() <= tolerance("synthesis.flat_eval")
-    # Nor where a caller hands such faces over as they are.
-    part = build("flat").parts[0]
-    flat = Mesostructure("own", {}, (Part(part.vertices, np.vstack([part.faces, [[0, 0, 1]]]), part.bsdf),))
-    values = btfref.synthesize(flat, **settings).values
-    assert np.abs(values - whole).max() / whole.max() <= tolerance("synthesis.flat_eval")
-
-
-def test_a_surface_wound_downwards_is_refused_where_it_would_be_black(tmp_path):
-    down = _bare(tmp_path, [*_corners(0, 1), "f 4 3 2 1"])
-    for text in (PLAIN.format("diffuse"), PLAIN.format("roughconductor")):
-        with pytest.raises(InputError, match=r"wound downwards.*1 of the surface.*twosided") as error:
-            build(down, **_material(tmp_path, text))
-        assert "\n" not in str(error.value)
-    both = '<bsdf version="3.0.0" type="twosided"><bsdf type="diffuse"/></bsdf>'
-    for text in (both, PLAIN.format("roughdielectric")):
-        assert build(down, **_material(tmp_path, text)).parts
-    assert build(_bare(tmp_path, [*_corners(0, 1), "f 1 2 3 4"]), **_material(tmp_path)).parts
-    # Shading normals that point up turn the face.
-    normals = [*_corners(0, 1), "vn 0 0 1", "f 4//1 3//1 2//1 1//1"]
-    assert build(_bare(tmp_path, normals), **_material(tmp_path)).parts
-
-
-def test_a_wavefront_material_that_emits_is_refused_and_maps_that_are_not_read_are_named(tmp_path):
-    file = _write_obj(tmp_path)
-    text = (tmp_path / "m.mtl").read_text()
-    (tmp_path / "m.mtl").write_text(text + "map_Bump t.png\nd 0.5\n")
-    assert build(file).ignored == (
-        "bump map of a Wavefront material (a)",
-        "opacity (d, Tr) of a Wavefront material (a)",
-    )
-    (tmp_path / "m.mtl").write_text(text + "Ke 1 1 1\n")
-    with pytest.raises(InputError, match=r"emits light.*a: Ke"):
-        build(file)
-    (tmp_path / "m.mtl").write_text(text)
-    file.write_text(file.read_text().replace("/1", "").replace("/2", "").replace("/3", "").replace("/4", ""))
-    with pytest.raises(InputError, match="texture on faces without texture coordinates"):
-        build(file)
