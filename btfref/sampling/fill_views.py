@@ -212,8 +212,16 @@ def _fill_by_views(
                 if len(chosen) == len(lights):
                     yield view
             del estimator
+            _give_back()
         if size.lights < len(lights):
             yield from group
+
+
+def _give_back() -> None:
+    """Memory that Dr.Jit keeps for arrays of the sizes of an estimator that is gone: the next one's differ."""
+    import drjit as dr
+
+    dr.flush_malloc_cache()
 
 
 def _groups(items: _Indices, size: int) -> list[_Indices]:
@@ -235,6 +243,7 @@ def _passes(
                 for total, term in zip(sums[view], (mean, variance), strict=True):
                     total += term
         del estimator
+        _give_back()
         for view in group:
             if passes[view] == number + 1:
                 mean, variance = sums.pop(view)
@@ -271,6 +280,7 @@ def _pilot_by_views(
             store.write_map("pilot", view, adaptive.pilot_map((mean, variance), (mean, variance), 1))
             yield view
         del estimator
+        _give_back()
 
 
 def _record_part(
