@@ -231,7 +231,8 @@ synthesize_store(sys.argv[1], "checker", texels=int(sys.argv[4]), views=views, l
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("estimator", "texels", "spp", "budget"), [("path", 256, 2, 1000), ("surface", 48, 16, 1400)]
+    ("estimator", "texels", "spp", "budget"),
+    [("path", 256, 2, 1000), ("surface", 48, 16, 1400), ("surface", 128, 10, 2000)],
 )
 def test_the_budget_is_kept(tmp_path, estimator, texels, spp, budget):
     """The budget bounds the process that does the work; 256² · 151² as a whole would be 17 GB."""
