@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from btfref.mesostructure.base import Mesostructure, Part
+from btfref.mesostructure.bodies.scattering import disjoint_radii, scattered
 from btfref.mesostructure.bodies.shapes import ellipsoids
 from btfref.mesostructure.checks import colour, number, whole
-from btfref.mesostructure.scattering import disjoint_radii, scattered
 
 #: Free space between drops, and between drops and ground, tile units.
 _GAP = 0.004

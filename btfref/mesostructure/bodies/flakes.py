@@ -8,9 +8,9 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.mesostructure.base import Mesostructure, Part, square_below
+from btfref.mesostructure.bodies.scattering import distances, scattered
 from btfref.mesostructure.bodies.shapes import plates, tilted
 from btfref.mesostructure.checks import colour, number, whole
-from btfref.mesostructure.scattering import distances, scattered
 
 #: Free space between flakes, and between flakes and ground, tile units.
 _GAP = 0.002

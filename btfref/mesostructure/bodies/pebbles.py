@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from btfref.mesostructure.base import Mesostructure, Part, square_below
+from btfref.mesostructure.bodies.scattering import disjoint_radii, scattered
 from btfref.mesostructure.bodies.shapes import ellipsoids
 from btfref.mesostructure.checks import colour, number, whole
-from btfref.mesostructure.scattering import disjoint_radii, scattered
 
 #: Free space between the circles in which stones lie, tile units.
 _GAP = 0.004

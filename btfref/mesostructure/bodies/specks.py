@@ -9,9 +9,9 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.mesostructure.base import Mesostructure, Part, square_below
+from btfref.mesostructure.bodies.scattering import disjoint_radii, scattered
 from btfref.mesostructure.bodies.shapes import plates
 from btfref.mesostructure.checks import colour, number, whole
-from btfref.mesostructure.scattering import disjoint_radii, scattered
 
 if TYPE_CHECKING:
     from btfref.types import Facts

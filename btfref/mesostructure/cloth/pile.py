@@ -8,9 +8,9 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.mesostructure.base import Mesostructure, Part, square_below
+from btfref.mesostructure.bodies.scattering import distances, scattered
 from btfref.mesostructure.bodies.shapes import fans, repeated
 from btfref.mesostructure.checks import colour, number, sweep_faces, whole
-from btfref.mesostructure.scattering import distances, scattered
 
 
 def pile(

@@ -6,9 +6,9 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.mesostructure.base import Mesostructure
+from btfref.mesostructure.bodies.scattering import scattered
 from btfref.mesostructure.checks import number, whole
 from btfref.mesostructure.relief.surface import cell_distances, relief
-from btfref.mesostructure.scattering import scattered
 
 
 def hammered(

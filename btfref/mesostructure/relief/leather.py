@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from btfref.mesostructure.base import Mesostructure
+from btfref.mesostructure.bodies.scattering import scattered
 from btfref.mesostructure.checks import colour, number, whole
 from btfref.mesostructure.relief.surface import cell_distances, random_waves, relief
-from btfref.mesostructure.scattering import scattered
 
 
 def leather(

@@ -9,9 +9,9 @@ import pytest
 from btfref.errors import InputError
 from btfref.mesostructure import FROM_FILES, MESOSTRUCTURES, Mesostructure, build
 from btfref.mesostructure.bodies import mail
+from btfref.mesostructure.bodies.scattering import disjoint_radii, distances, scattered
 from btfref.mesostructure.cloth import knit, weave
 from btfref.mesostructure.relief.surface import random_waves
-from btfref.mesostructure.scattering import disjoint_radii, distances, scattered
 from btfref.mesostructure.solids import bodies, meetings, open_edges
 
 MODELLED = sorted(set(MESOSTRUCTURES) - set(FROM_FILES) - {"flat"})
