@@ -35,7 +35,7 @@ LOOKUPS = 4
 _VIEWS, _PLACES = 8, 16
 
 #: Pixels along a side of a picture, and where they look from and are lit from: polar angle and azimuth, degrees.
-_SIDE, _VIEW, _LIGHT = 64, (55, 270), (40, 60)
+_SIDE, _VIEW, _LIGHT = 48, (55, 270), (40, 60)
 
 
 def run(

@@ -100,7 +100,7 @@ def _from_above(mesostructure: Mesostructure, texels: int) -> dict[str, np.ndarr
 
     tiles = TiledScene(mesostructure, np.array([[np.sin(REACH), 0, np.cos(REACH)]]))
     tiles.wrap_shadows = tiles.low < 0
-    uv = to_device(mi.Point2f, centres(texels))
+    uv = to_device(mi.Point2f, centres(texels).T)
     n = texels * texels
     si = tiles.intersect(mi.Point3f(uv.x, uv.y, START), mi.Vector3f(0, 0, -1))
     bsdf = si.bsdf()

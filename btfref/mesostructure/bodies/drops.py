@@ -19,8 +19,8 @@ def drops(
     *,
     count: int = 12,
     height: float = 0.8,
-    ior: float = 1.4,
-    roughness: float = 0.18,
+    ior: float = 1.5,
+    roughness: float = 0.5,
     stripes: int = 4,
     first_colour: Sequence[float] = (0.75, 0.72, 0.66),
     second_colour: Sequence[float] = (0.04, 0.22, 0.25),
@@ -39,7 +39,7 @@ def drops(
     ior : float
         Index of refraction, [1.05, 2.5].
     roughness : float
-        GGX α, [0.05, 1]: light finds its way through rough surfaces alone.
+        GGX α, [0.1, 1]: light finds its way through rough surfaces alone, and through smoother ones with more noise.
     stripes : int
         Stripes of each colour.
     first_colour, second_colour : sequence of 3 floats
@@ -62,7 +62,7 @@ def drops(
         "count": whole("drops", "count", count, 2, 200),
         "height": number("drops", "height", height, 0.05, 1.0),
         "ior": number("drops", "ior", ior, 1.05, 2.5),
-        "roughness": number("drops", "roughness", roughness, 0.05, 1.0),
+        "roughness": number("drops", "roughness", roughness, 0.1, 1.0),
         "stripes": whole("drops", "stripes", stripes, 1, 64),
         "first_colour": colour("drops", "first_colour", first_colour),
         "second_colour": colour("drops", "second_colour", second_colour),
