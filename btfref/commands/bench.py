@@ -17,7 +17,7 @@ from btfref.bench.plan import SUFFIX, shipped
 from btfref.commands.shared.options import add_json, add_only, add_overwrite, words
 from btfref.commands.shared.printing import Progress, emit, emit_json, table
 from btfref.commands.shared.reading import output_file
-from btfref.datasets.package import FOLDER as DATA
+from btfref.datasets.sets import FOLDER as DATA
 from btfref.errors import InputError
 
 if TYPE_CHECKING:

@@ -23,6 +23,7 @@ from btfref.datasets.manifest import (
     write_croissant,
     write_manifest,
 )
+from btfref.datasets.sets import VARIANT
 from btfref.errors import InputError
 from btfref.outputs import new_file
 from btfref.provenance import LLVM, __version__, versions
@@ -32,9 +33,6 @@ if TYPE_CHECKING:
     from btfref.mesostructure.base import Mesostructure
     from btfref.sampling.scheduling import Scheduler
     from btfref.types import Facts, PathLike, Progress
-
-#: Mitsuba variant of all sets: its bytes are what is published.
-VARIANT = "llvm_ad_rgb"
 
 #: What the bytes of a package depend on.
 VERSIONS = ("numpy", "mitsuba", "drjit", "zarr", LLVM)

@@ -13,6 +13,7 @@ import numpy as np
 
 from btfref.datasets import sets
 from btfref.datasets.manifest import MANIFEST, read_manifest
+from btfref.datasets.sets import FOLDER
 from btfref.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,9 +21,6 @@ if TYPE_CHECKING:
     from btfref.querying.files.zarr_file import QueryFile
     from btfref.sampling import SampledBTF
     from btfref.types import Facts, PathLike, Progress
-
-#: Where packages are looked for and made when nobody says where.
-FOLDER = "btfref-data"
 
 
 @dataclass(frozen=True)

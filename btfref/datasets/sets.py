@@ -105,6 +105,12 @@ class DataSet:
 #: and of the maps.
 GRID_SEED, TEST_SEED, TRAINING_SEED, MAP_SEED = 1, 1_618_033, 2_718_281, 3
 
+#: Mitsuba variant of all sets: its bytes are what is published.
+VARIANT = "llvm_ad_rgb"
+
+#: Where packages are looked for and made when nobody says where.
+FOLDER = "btfref-data"
+
 #: Largest polar angle of queries, degrees.
 MAX_THETA = 85.0
 

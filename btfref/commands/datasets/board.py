@@ -20,7 +20,7 @@ OUTPUTS = {"output": "folder"}
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
-    from btfref.datasets.package import FOLDER
+    from btfref.datasets.sets import FOLDER
 
     parser.add_argument("results", nargs="+", metavar="RESULTS", help="files *.row.json, or folders of them")
     parser.add_argument(

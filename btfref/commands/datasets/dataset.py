@@ -37,9 +37,7 @@ _NUMBERS = {
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
-    from btfref.datasets.making import VARIANT
-    from btfref.datasets.package import FOLDER
-    from btfref.datasets.sets import SETS
+    from btfref.datasets.sets import FOLDER, SETS, VARIANT
 
     tiers = next(iter(SETS.values())).tiers
     parser.add_argument("action", choices=ACTIONS, metavar="ACTION", help=", ".join(ACTIONS))
@@ -61,7 +59,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Carry the command out."""
-    from btfref.datasets.making import VARIANT
+    from btfref.datasets.sets import VARIANT
 
     if args.variant != VARIANT:
         raise InputError(
