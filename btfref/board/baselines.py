@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import statistics
 import tempfile
@@ -47,12 +48,12 @@ def run(
     folder: PathLike,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Write a row for each entry of a plan.
+    """Write a row for each entry of a plan; materials are added to rows of the same versions that are there.
 
     Parameters
     ----------
     plan : btfref.bench.plan.Plan
-        Whose entries are fitted with its seed; with "eval" among its measures they are timed on the first material.
+        Whose entries are fitted with its seed; with "eval" among its measures they are timed on one material.
     name : str
         "SET", or "SET/MATERIAL".
     out : path-like
@@ -69,11 +70,14 @@ def run(
     """
     chosen, materials = sets.find(name)
     out = Path(out)
-    rows: dict[str, Facts] = {entry.name: _begun(entry, plan) for entry in plan.entries}
+    out.mkdir(parents=True, exist_ok=True)
     total, done = len(materials) * len(plan.entries), 0
-    for number, material in enumerate(materials):
+    written = {entry.name: out / f"{_file_name(entry.name)}{ENDING}" for entry in plan.entries}
+    for material in materials:
         package = dataset(f"{chosen.name}/{material.name}", tier=tier, folder=folder)
         btf = package.grid(variance=False)
+        facts = {"set": chosen.name, "set_version": chosen.version, "tier": tier}
+        facts["fitted"] = f"grid {package.grids[-1]}"
         built: dict[str, Built] = {}
         for entry in plan.entries:
             if progress is not None:
@@ -82,36 +86,40 @@ def run(
             payload = built[entry.bytes_of].payload if entry.bytes_of else None
             built[entry.name] = made = build(entry, btf, seed=plan.seed, payload=payload)
             seconds = time.process_time() - start
-            row = rows[entry.name]
-            row["fitted"] = f"grid {package.grids[-1]}"
+            row = _row(written[entry.name], _about(entry) | facts)
             row["materials"][material.name] = {
                 **_answered(made, package, out, _file_name(entry.name)),
                 "bytes": made.payload,
                 "fit_seconds": seconds,
                 **energy_and_reciprocity(made),
             }
-            if number == 0 and "eval" in plan.measures:
+            if "eval" in plan.measures and "evaluate_ns" not in row:
                 row["evaluate_ns"] = _times(made, entry, plan)
+            write_row(written[entry.name], row)
             done += 1
-    written = []
-    for entry in plan.entries:
-        path = out / f"{_file_name(entry.name)}{ENDING}"
-        write_row(path, rows[entry.name] | {"set": chosen.name, "set_version": chosen.version, "tier": tier})
-        written.append(path)
     if progress is not None:
         progress(total, total, "rows")
-    return written
+    return list(written.values())
 
 
-def _begun(entry: Entry, plan: Plan) -> Facts:
-    """A row without its materials."""
+def _row(path: Path, about: Facts) -> Facts:
+    """A row without materials, or the one that is there where it is of the same method, set and versions."""
+    try:
+        found = json.loads(path.read_text("utf-8"))
+        same = all(found.get(key) == value for key, value in about.items())
+    except (OSError, ValueError, AttributeError):
+        same = False
+    return found if same else about | {"materials": {}}
+
+
+def _about(entry: Entry) -> Facts:
+    """What a row says of its method."""
     setting = entry.name.removeprefix(entry.method or entry.peer).strip(" (,").rstrip(")")
     return {
         "method": entry.method or entry.name,
         "setting": setting if entry.method else "",
         "by": "btfref" if entry.method else "btfref, a peer",
         "suite": __version__,
-        "materials": {},
     }
 
 

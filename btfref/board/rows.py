@@ -200,4 +200,4 @@ def write_row(path: Path, facts: Facts) -> None:
     from btfref.outputs import new_file
 
     with new_file(path) as draft:
-        draft.write_text(json.dumps({"kind": KIND, "schema": SCHEMA, **facts}, indent=1) + "\n", "utf-8")
+        draft.write_text(json.dumps({**facts, "kind": KIND, "schema": SCHEMA}, indent=1) + "\n", "utf-8")

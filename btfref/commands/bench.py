@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING
 
 from btfref.bench import PICTURED, SUITES
 from btfref.bench.plan import SUFFIX, shipped
-from btfref.commands.shared.options import add_json, add_only, add_overwrite, words
+from btfref.commands.shared.options import add_data_folder, add_json, add_only, add_overwrite, words
 from btfref.commands.shared.printing import Progress, emit, emit_json, table
 from btfref.commands.shared.reading import output_file
-from btfref.datasets.sets import FOLDER as DATA
 from btfref.errors import InputError
 
 if TYPE_CHECKING:
@@ -52,10 +51,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="fit a plan's methods to a standard data set (btf-1, or btf-1/MATERIAL), ask its test queries and write "
         "rows for btfref board into -o FOLDER",
     )
-    parser.add_argument("--tier", default="toy", help="of the data set (default %(default)s)")
-    parser.add_argument(
-        "--folder", default=DATA, metavar="FOLDER", help="where its packages lie (default %(default)s)"
-    )
+    add_data_folder(parser)
     parser.add_argument(
         "--plot", metavar="FILE.png", help="draw how the cost (suite synth) or the error (env) grows"
     )
@@ -112,13 +108,16 @@ def _plan(args: Namespace) -> int:
 def _rows(args: Namespace) -> int:
     from btfref.bench.plan import read_plan
     from btfref.board.baselines import refuse_other_data, run
+    from btfref.datasets.sets import FOLDER
 
     if not args.output:
         raise InputError("rows of a board are files", field="-o", expected="a folder for them")
     plan = read_plan(shipped().get(args.suite, args.suite), quick=args.quick, only=words(args.only))
     refuse_other_data(plan, args.btf)
     with Progress() as progress:
-        written = run(plan, args.dataset, args.output, tier=args.tier, folder=args.folder, progress=progress)
+        written = run(
+            plan, args.dataset, args.output, tier=args.tier, folder=args.folder or FOLDER, progress=progress
+        )
     if args.json:
         emit_json([str(path) for path in written])
         return 0

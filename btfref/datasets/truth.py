@@ -108,11 +108,14 @@ def _from_above(mesostructure: Mesostructure, texels: int) -> dict[str, np.ndarr
     found = dr.reinterpret_array(mi.UInt32, bsdf).numpy()
     valid = si.is_valid()
     words = stream_keys(MAP_SEED, 1)
-    albedo, open_ = mi.Color3f(0), mi.Float(0)
+    albedo, open_ = dr.opaque(mi.Color3f, 0, n), dr.opaque(mi.Float, 0, n)
     context = mi.BSDFContext()
+    dr.eval(si, bsdf, valid)
     for k in range(_SIDE * _SIDE):
-        u, v, lobe, _ = uniforms(dr.arange(mi.UInt32, n), words, mi.UInt32(k))
-        u, v = (k % _SIDE + u) / _SIDE, (k // _SIDE + v) / _SIDE
+        # Opaque, so that all of them are one kernel.
+        number, column, row = (dr.opaque(mi.UInt32, word) for word in (k, k % _SIDE, k // _SIDE))
+        u, v, lobe, _ = uniforms(dr.arange(mi.UInt32, n), words, number)
+        u, v = (mi.Float(column) + u) / _SIDE, (mi.Float(row) + v) / _SIDE
         above = type(si)(si)
         above.wi = mi.Vector3f(0, 0, 1)
         _, weight = bsdf.sample(context, above, lobe, mi.Point2f(u, v), valid)

@@ -1,7 +1,7 @@
 """Judge methods on a standard data set and write the board: a static page, sortable and filterable.
 
-RESULTS are files *.row.json, or folders of them: those that btfref bench methods --dataset btf-1 -o FOLDER writes, and
-any that others hand in with their answers to the test queries beside (the guide says how).
+RESULTS are files *.row.json, or folders of them: those that btfref bench methods --dataset btf-1 -o FOLDER writes,
+and any that others hand in with their answers to the test queries beside (the guide says how).
 
   btfref bench methods --dataset btf-1 --folder data -o results
   btfref board results outsider.row.json --folder data -o site
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from btfref.commands.shared.options import add_json
+from btfref.commands.shared.options import add_data_folder, add_json
 from btfref.commands.shared.printing import Progress, bytes_text, emit, emit_json, number, table
 
 #: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
@@ -20,15 +20,8 @@ OUTPUTS = {"output": "folder"}
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
-    from btfref.datasets.sets import FOLDER
-
     parser.add_argument("results", nargs="+", metavar="RESULTS", help="files *.row.json, or folders of them")
-    parser.add_argument(
-        "--folder",
-        default=FOLDER,
-        metavar="FOLDER",
-        help="where the set's packages lie (default %(default)s)",
-    )
+    add_data_folder(parser, tier=False)
     parser.add_argument("-o", "--output", required=True, metavar="FOLDER", help="of the site")
     add_json(parser, "what the page holds")
 
@@ -36,9 +29,10 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(args: Namespace) -> int:
     """Carry the command out."""
     from btfref.board.site import write_site
+    from btfref.datasets.sets import FOLDER
 
     with Progress() as progress:
-        found = write_site(args.results, args.output, folder=args.folder, progress=progress)
+        found = write_site(args.results, args.output, folder=args.folder or FOLDER, progress=progress)
     if args.json:
         emit_json(found)
         return 0

@@ -15,9 +15,10 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from btfref.commands.shared.options import add_json, add_memory, add_tracing
+from btfref.commands.shared.options import add_data_folder, add_json, add_memory, add_tracing
 from btfref.commands.shared.printing import Progress, bytes_text, emit, emit_json, number, table
 from btfref.errors import InputError
+from btfref.sampling.settings import SynthesisSettings
 from btfref.types import Facts
 
 ACTIONS = ("list", "make", "verify", "card")
@@ -37,9 +38,6 @@ _NUMBERS = {
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Describe the command's arguments."""
-    from btfref.datasets.sets import FOLDER, SETS, VARIANT
-
-    tiers = next(iter(SETS.values())).tiers
     parser.add_argument("action", choices=ACTIONS, metavar="ACTION", help=", ".join(ACTIONS))
     parser.add_argument(
         "name",
@@ -47,20 +45,18 @@ def add_arguments(parser: ArgumentParser) -> None:
         metavar="NAME",
         help="MATERIAL, SET/MATERIAL or all (needed to make; default all)",
     )
-    parser.add_argument("--tier", choices=tuple(tiers), default="toy", help="size (default %(default)s)")
-    parser.add_argument(
-        "--folder", default=FOLDER, metavar="FOLDER", help="where packages lie (default %(default)s)"
-    )
+    add_data_folder(parser)
     parser.add_argument("--overwrite", action="store_true", help="replace packages of another version")
     add_memory(parser, "budget of the synthesis, e.g. 2G; without influence on any byte")
-    add_tracing(parser, VARIANT)
+    add_tracing(parser, SynthesisSettings.variant)
     add_json(parser, "what was found")
 
 
 def run(args: Namespace) -> int:
     """Carry the command out."""
-    from btfref.datasets.sets import VARIANT
+    from btfref.datasets.sets import FOLDER, VARIANT
 
+    args.folder = args.folder or FOLDER
     if args.variant != VARIANT:
         raise InputError(
             "bytes of sets are those of one variant", field="--variant", got=args.variant, expected=VARIANT
