@@ -1,9 +1,9 @@
 """Order of methods over materials, and how sure it is.
 
-A method's score is the geometric mean over the materials of its error over the smallest of that material: 1 is the best
-on all of them. Only rows that answered the same materials as most are ranked. Which materials a set has is a choice,
-and errors have intervals: places are told as the middle 90 % of those over random sets of materials, drawn with
-replacement, with errors drawn from their intervals.
+A method's score is the geometric mean over the materials of its error over the smallest of that material, errors below
+1 % counted as 1 %: 1 is the best on all of them. Only rows that answered as many materials as any are ranked. Which
+materials a set has is a choice, and errors have intervals: places are told as the middle 90 % of those over random sets
+of materials, drawn with replacement, with errors drawn from their intervals.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ DRAWS, SEED = 2000, 20_260_101
 #: Standard deviations to either end of an interval of 99 %.
 _Z99 = 2.5758
 
-#: An error is not counted as smaller than this share of the largest: what repeats the data would win any mean.
-_LEAST = 1e-4
+#: Errors are not counted as smaller than this: what is exact on the easiest material would win any mean of ratios.
+_LEAST = 0.01
 
 
 def ranked(errors: list[dict[str, Facts]], *, footprint: str = "point", metric: str = "nrmse") -> list[Facts]:
@@ -65,7 +65,7 @@ def ranked(errors: list[dict[str, Facts]], *, footprint: str = "point", metric: 
 
 
 def _floored(values: np.ndarray) -> np.ndarray:
-    return np.maximum(values, _LEAST * np.maximum(values.max(axis=-2, keepdims=True), 1e-300))
+    return np.maximum(values, _LEAST)
 
 
 def _scores(values: np.ndarray) -> np.ndarray:
