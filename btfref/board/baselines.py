@@ -184,7 +184,7 @@ def energy_and_reciprocity(built: Built) -> dict[str, float]:
     from btfref.numerics.sphere.directions import directions
 
     grid = directions("6x12")
-    weights = grid.quadrature_weights()
+    weights = grid.quadrature_weights
     rng = np.random.default_rng(0)
     uv = rng.random((_PLACES, 2))
     some = grid.vectors[rng.choice(len(grid), _VIEWS, replace=False)]
