@@ -117,6 +117,8 @@ def read_row(path: PathLike) -> Row:
     path = Path(path)
     try:
         found = json.loads(path.read_text("utf-8"))
+    except UnicodeDecodeError:
+        raise InputError("cannot be read", file=path, got="no UTF-8 text", expected="JSON") from None
     except (OSError, ValueError) as error:
         raise InputError("cannot be read", file=path, got=error, expected="JSON") from None
     if not isinstance(found, dict) or found.get("kind") != KIND:
