@@ -37,6 +37,22 @@ if TYPE_CHECKING:
 #: What the bytes of a package depend on.
 VERSIONS = ("numpy", "mitsuba", "drjit", "zarr", LLVM)
 
+#: Facts of a manifest that tell one version of a set from another; what else differs is said and is no fault.
+IDENTITY = (
+    "set",
+    "set_version",
+    "tier",
+    "material",
+    "mesostructure",
+    "parameters",
+    "geometry",
+    "settings",
+    "seeds",
+    "max_depth",
+    "max_theta",
+    "variant",
+)
+
 #: Name of the first half of a footprint's test queries, and of the second.
 TEST = ("test-{}.queries.zarr", "test-{}-second.queries.zarr")
 
@@ -173,9 +189,11 @@ def _begin(where: Path, facts: Facts, overwrite: bool) -> bool:
     """Whether there is anything to make; a package of other facts is refused or removed."""
     there = facts_of(where)
     if there is not None:
-        differ = differences(facts, there)
+        finished = (where / MANIFEST).is_file()
+        # A finished package stays what it is when a library is updated; a half-done one must not be mixed.
+        differ = [key for key in differences(facts, there) if not finished or key in IDENTITY]
         if not differ:
-            return not (where / MANIFEST).is_file()
+            return not finished
         if not overwrite:
             raise InputError(
                 "a package of another version",

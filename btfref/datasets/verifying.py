@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from btfref.datasets import sets
-from btfref.datasets.making import differences, expected, place
+from btfref.datasets.making import IDENTITY, differences, expected, place
 from btfref.datasets.manifest import digest, files_of, read_manifest, sha256
 from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
@@ -21,22 +21,6 @@ from btfref.gates.tolerances import tolerance
 if TYPE_CHECKING:
     from btfref.datasets.sets import DataSet, Material
     from btfref.types import Facts, PathLike, Progress
-
-#: Facts of a manifest that tell one version of a set from another; what else differs is said and is no fault.
-_VERSION = (
-    "set",
-    "set_version",
-    "tier",
-    "material",
-    "mesostructure",
-    "parameters",
-    "geometry",
-    "settings",
-    "seeds",
-    "max_depth",
-    "max_theta",
-    "variant",
-)
 
 
 def verify(
@@ -118,7 +102,7 @@ def _verified(where: Path, chosen: DataSet, tier: str, material: Material) -> Fa
         problems += [
             f"another version: {key} is {_short(manifest.get(key))}, expected {_short(wanted[key])}"
             for key in differ
-            if key in _VERSION
+            if key in IDENTITY
         ]
         if "versions" in differ:
             notes += [

@@ -166,6 +166,15 @@ def test_verify_finds_another_version(copied, monkeypatch, capsys):
         make("flat", copied)
 
 
+def test_a_library_of_another_version_is_said_and_is_no_fault(copied, monkeypatch, capsys):
+    monkeypatch.setattr("btfref.datasets.making.versions", lambda names: {"numpy": "99"})
+    before = contents(copied / "btf-1/toy/flat")
+    make("flat", copied)
+    assert contents(copied / "btf-1/toy/flat") == before
+    assert main(["dataset", "verify", "--folder", str(copied)]) == 0
+    assert "here 99" in capsys.readouterr().out
+
+
 @pytest.mark.long
 def test_a_package_of_another_version_is_replaced_when_asked(copied, monkeypatch):
     known = sets.SETS["btf-1"]
