@@ -256,7 +256,7 @@ def _queries(where: Path, size: Tier, built: Mesostructure, means: Facts) -> Non
     from btfref.querying.job import QueryJob, fill_file
 
     folder = where / "queries"
-    common = {
+    common: Facts = {
         "max_theta": sets.MAX_THETA,
         "max_depth": sets.MAX_DEPTH,
         "footprint": "square",

@@ -105,7 +105,8 @@ def read_manifest(folder: Path) -> Facts:
         found = json.loads(path.read_text("utf-8"))
         kind, schema, files = found["kind"], found["schema"], found["files"]
         sound = isinstance(files, dict) and all(
-            isinstance(entry["sha256"], str) and isinstance(entry["bytes"], int) for entry in files.values()
+            bool(isinstance(entry["sha256"], str) and isinstance(entry["bytes"], int))
+            for entry in files.values()
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError("manifest cannot be read", file=path, got=error) from None

@@ -37,13 +37,10 @@ fill("metric", Object.entries(board.metrics));
 const higher = (metric) => metric === "psnr_log";
 const state = { key: "rank", down: false };
 
-// What a row shows: over all materials the mean (geometric for errors), else those of one material.
-const mean = (values, geometric) => {
+// What a row shows: over all materials the mean, else those of one material.
+const mean = (values) => {
   const some = values.filter((x) => x !== null && x !== undefined);
-  if (!some.length) return null;
-  return geometric
-    ? Math.exp(some.reduce((s, x) => s + Math.log(Math.max(x, 1e-12)), 0) / some.length)
-    : some.reduce((s, x) => s + x, 0) / some.length;
+  return some.length ? some.reduce((s, x) => s + x, 0) / some.length : null;
 };
 const values = (row) => {
   const material = at("material").value, footprint = at("footprint").value, metric = at("metric").value;
@@ -58,16 +55,16 @@ const values = (row) => {
     from: material ? null : rank.from,
     to: material ? null : rank.to,
     score: material ? null : rank.score,
-    error: mean(errors.map((e) => e[0]), metric !== "psnr_log"),
+    error: mean(errors.map((e) => e[0])),
     low: material ? errors[0][1] : null,
     high: material ? errors[0][2] : null,
-    bytes: mean(some.map((m) => m.bytes), false),
-    fit: mean(some.map((m) => m.fit_seconds), false),
+    bytes: mean(some.map((m) => m.bytes)),
+    fit: mean(some.map((m) => m.fit_seconds)),
     numpy: row.evaluate_ns.numpy ?? null,
     drjit: row.evaluate_ns.drjit ?? null,
     glsl: row.evaluate_ns.glsl ?? null,
     energy: some.reduce((s, m) => (m.energy === undefined ? s : Math.max(s ?? 0, m.energy)), null),
-    reciprocity: mean(some.map((m) => m.reciprocity), false),
+    reciprocity: mean(some.map((m) => m.reciprocity)),
     count: some.length,
     row,
   };
@@ -161,8 +158,8 @@ const tell = () => {
   } else at("facts").textContent = "";
   at("legend").textContent =
     "Rank and score are by RMSE over RMS at the chosen footprint: the score is the geometric mean over materials of the error over the " +
-    "smallest of the material; small figures are the middle 90 % of ranks over random sets of materials. Over all " +
-    "materials, errors are geometric means (PSNR: the mean), energy is the largest, all else are means." +
+    "smallest of the material, below 1 % counted as 1 %; small figures are the middle 90 % of ranks over random sets of materials. Over all " +
+    "materials energy is the largest, all else are means; times are of the machine that handed the row in." +
     (higher(at("metric").value) ? " More PSNR is better." : "");
 };
 

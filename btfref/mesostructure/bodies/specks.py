@@ -65,7 +65,7 @@ def specks(
     """
     if not isinstance(metal, str):
         raise InputError("parameter of specks", field="metal", got=metal, expected="a name such as Au")
-    parameters = {
+    parameters: Facts = {
         "count": whole("specks", "count", count, 2, 200),
         "layer": number("specks", "layer", layer, 1e-3, 0.5),
         "largest": number("specks", "largest", largest, 1e-3, 0.45),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,6 +11,9 @@ from btfref.errors import InputError
 from btfref.mesostructure.base import Mesostructure, Part, square_below
 from btfref.mesostructure.checks import colour, number, whole
 from btfref.mesostructure.cloth.yarns import fibre, round_tubes
+
+if TYPE_CHECKING:
+    from btfref.types import Facts
 
 #: Smallest clearance between yarns as a share of their thickness: facets lie inside the round tube.
 _CLEARANCE = 0.02
@@ -61,7 +65,7 @@ def knit(
     InputError
         A value out of range, or yarns that would meet.
     """
-    parameters = {
+    parameters: Facts = {
         "columns": whole("knit", "columns", columns, 2, 32),
         "rows": whole("knit", "rows", rows, 2, 32),
         "thickness": number("knit", "thickness", thickness, 0.01, 0.5),

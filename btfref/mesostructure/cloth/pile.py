@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +12,9 @@ from btfref.mesostructure.base import Mesostructure, Part, square_below
 from btfref.mesostructure.bodies.scattering import distances, scattered
 from btfref.mesostructure.bodies.shapes import fans, repeated
 from btfref.mesostructure.checks import colour, number, sweep_faces, whole
+
+if TYPE_CHECKING:
+    from btfref.types import Facts
 
 
 def pile(
@@ -65,7 +69,7 @@ def pile(
     InputError
         A value out of range, or fibres that would meet.
     """
-    parameters = {
+    parameters: Facts = {
         "fibres": whole("pile", "fibres", fibres, 4, 2000),
         "thickness": number("pile", "thickness", thickness, 1e-4, 0.2),
         "length": number("pile", "length", length, 1e-3, 2.0),
@@ -114,7 +118,7 @@ def pile(
 
 
 def _fibres(
-    feet: np.ndarray, astray: np.ndarray, tall: np.ndarray, parameters: dict
+    feet: np.ndarray, astray: np.ndarray, tall: np.ndarray, parameters: Facts
 ) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and normals: rings from the foot to the tip, then the ends' middles."""
     segments, sides = parameters["segments"], parameters["sides"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,6 +11,9 @@ from btfref.errors import InputError
 from btfref.mesostructure.base import Mesostructure, Part, square_below
 from btfref.mesostructure.checks import colour, number, whole
 from btfref.mesostructure.cloth.yarns import fibre, upright_tubes
+
+if TYPE_CHECKING:
+    from btfref.types import Facts
 
 #: Smallest clearance between two yarns, in half thicknesses: far above what facets take off.
 CLEARANCE = 0.02
@@ -147,9 +151,9 @@ def crossing_heights(over: np.ndarray, amplitude: float, segments: int) -> tuple
     return height, -0.5 * np.pi * count * (here - there) * np.sin(phase)
 
 
-def _woven(name: str, over: np.ndarray, given: dict) -> Mesostructure:
+def _woven(name: str, over: np.ndarray, given: Facts) -> Mesostructure:
     """A weave in which warp yarns (along x, rows) are over weft yarns where `over` says so."""
-    parameters = {
+    parameters: Facts = {
         "count": len(over),
         "width": number(name, "width", given["width"], 0.05, 0.95),
         "thickness": number(name, "thickness", given["thickness"], 1e-4, 0.5),

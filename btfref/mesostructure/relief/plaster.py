@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.mesostructure.base import Mesostructure
 from btfref.mesostructure.checks import colour, number, whole
 from btfref.mesostructure.relief.surface import random_waves, relief
+
+if TYPE_CHECKING:
+    from btfref.types import Facts
 
 
 def plaster(
@@ -47,7 +51,7 @@ def plaster(
     InputError
         A value out of range.
     """
-    parameters = {
+    parameters: Facts = {
         "amplitude": number("plaster", "amplitude", amplitude, 1e-6, 1.0),
         "lowest": whole("plaster", "lowest", lowest, 1, 64),
         "highest": whole("plaster", "highest", highest, lowest, 64),
