@@ -264,7 +264,7 @@ def _queries(where: Path, size: Tier, built: Mesostructure, means: Facts) -> Non
     }
     for number, (footprint, texels) in enumerate(sets.FOOTPRINTS.items()):
         for stream, name in enumerate(TEST):
-            settings = {
+            settings: Facts = {
                 "n": size.test_rows,
                 "spp": size.test_spp,
                 "seed": sets.TEST_SEED + number,

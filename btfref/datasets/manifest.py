@@ -68,7 +68,7 @@ def write_manifest(folder: Path, facts: Facts) -> Facts:
     dict
         The manifest.
     """
-    files = {
+    files: Facts = {
         name: {"bytes": (folder / name).stat().st_size, "sha256": sha256(folder / name)}
         for name in files_of(folder)
     }

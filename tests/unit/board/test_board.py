@@ -86,7 +86,8 @@ def hand_in(folder, name, spread, **changes):
         "materials": entries,
     }
     path = folder / f"{name}.row.json"
-    rows.write_row(path, facts | changes)
+    rows.write_row(path, facts)
+    path.write_text(json.dumps(json.loads(path.read_text("utf-8")) | changes))
     return path
 
 
