@@ -18,6 +18,8 @@ from btfref.datasets.truth import MAPS
 from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
 from btfref.mesostructure import _CATALOGUE, names
+from btfref.querying import distribute
+from btfref.querying.job import QueryJob
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -315,3 +317,20 @@ def test_rows_of_the_suite_reach_the_board(data, tmp_path, capsys):
         assert 0 < entry["energy"] < 1
         assert entry["errors"]["point"]["nrmse"][0] < 1
         assert (tmp_path / "site" / entry["picture"]).is_file()
+
+
+def test_the_second_half_is_of_other_random_numbers_whoever_makes_it(tmp_path):
+    """Rationale: two halves of one stream would take no noise out. Expected: their files differ in nothing but the
+    stream, workers make the same one, and answers differ.
+    """
+    settings = {"n": 64, "spp": 2, "resolution": 16}
+    first, second = (QueryJob.of("checker", None, settings, stream=stream) for stream in (0, 1))
+    assert second.attributes == first.attributes | {"stream": 1}
+    distribute._write(tmp_path / "order", second)
+    assert distribute.read_order(tmp_path / "order").stream == 1
+    rows = []
+    for job in (first, second):
+        with job.ready():
+            rows.append(job.rows(job.make_source(), 0, 64))
+    assert np.array_equal(rows[0]["uv"], rows[1]["uv"])
+    assert not np.array_equal(rows[0]["B"], rows[1]["B"])
