@@ -177,10 +177,10 @@ _MATERIALS = (
         "medium: sharp borders between dull, glossy and metal discs, on three levels.",
     ),
     Material(
-        "drops",
-        "drops",
+        "blisters",
+        "blisters",
         "translucent",
-        "hard: a ground that is seen and lit through rough glass; noise, bent parallax.",
+        "medium: thin shells that glow; the ground is lit through them.",
     ),
     Material(
         "tissue",

@@ -24,9 +24,9 @@ __all__ = ["MESOSTRUCTURES", "Mesostructure", "Part", "build", "names"]
 
 #: name -> "module:function", imported when asked for.
 MESOSTRUCTURES = {
+    "blisters": "btfref.mesostructure.bodies.blisters:blisters",
     "brushed": "btfref.mesostructure.relief.brushed:brushed",
     "checker": "btfref.mesostructure.checker:checker",
-    "drops": "btfref.mesostructure.bodies.drops:drops",
     "flakes": "btfref.mesostructure.bodies.flakes:flakes",
     "flat": "btfref.mesostructure.flat:flat",
     "hammered": "btfref.mesostructure.relief.hammered:hammered",

@@ -1,1 +1,1 @@
-"""Closed bodies over a plane: rings, grains, drops and plates."""
+"""Closed bodies over a plane: rings, grains, blisters and plates."""

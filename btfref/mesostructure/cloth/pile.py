@@ -11,6 +11,7 @@ from btfref.errors import InputError
 from btfref.mesostructure.base import Mesostructure, Part, square_below
 from btfref.mesostructure.bodies.scattering import distances, scattered
 from btfref.mesostructure.bodies.shapes import fans, repeated
+from btfref.mesostructure.bodies.thin import thin
 from btfref.mesostructure.checks import colour, number, sweep_faces, whole
 
 if TYPE_CHECKING:
@@ -104,14 +105,7 @@ def pile(
     one = np.concatenate([sweep_faces(rings, sides)[:, ::-1], *fans(rings, sides)])
     faces = repeated(one, each, fibres)
     vertices[:, 2] -= vertices[:, 2].max()
-    bsdf = {
-        "type": "principledthin",
-        "base_color": {"type": "rgb", "value": parameters["fibre_colour"]},
-        "roughness": float(roughness),
-        "diff_trans": float(transmission),
-        "spec_trans": 0.0,
-        "eta": 1.5,
-    }
+    bsdf = thin(parameters["fibre_colour"], roughness, transmission)
     ground = {"type": "diffuse", "reflectance": {"type": "rgb", "value": parameters["ground_colour"]}}
     plane = square_below(vertices[:, 2].min() - 0.02 * length, ground)
     return Mesostructure("pile", parameters, (Part(vertices, faces, bsdf, normals=normals), plane))

@@ -18,7 +18,7 @@ MODELLED = sorted(set(MESOSTRUCTURES) - set(FROM_FILES) - {"flat"})
 
 #: Bodies of the tile where it is not one field.
 BODIES = {
-    "drops": 12,
+    "blisters": 12,
     "flakes": 40,
     "knit": 5,
     "mail": 27,
@@ -87,8 +87,8 @@ def test_shading_normals_agree_with_the_facets(name):
     [
         ("brushed", {"material": 1}, "material"),
         ("brushed", {"along": 0}, "along"),
-        ("drops", {"roughness": 0.01}, "roughness"),
-        ("drops", {"count": 1}, "count"),
+        ("blisters", {"transmission": 3}, "transmission"),
+        ("blisters", {"count": 1}, "count"),
         ("flakes", {"radius": 0.3}, "radius"),
         ("flakes", {"tilt": 90}, "tilt"),
         ("hammered", {"resolution": 4096}, "resolution"),
