@@ -37,9 +37,8 @@ def reflected(tile, theta):
     return share.mean(0), share.std(0, ddof=1) / np.sqrt(ROWS)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name == "plaster" else [pytest.mark.long]) for name in MODELLED]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("name", MODELLED)
 def test_no_more_light_leaves_than_comes(name):
     tile = build(name)
     for theta in THETA:

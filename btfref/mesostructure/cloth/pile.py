@@ -95,8 +95,13 @@ def pile(
             expected=f"below {distances(feet).min() / 1.02:.4g}, or fewer fibres",
         )
     angle = 2 * np.pi * rng.random(fibres)
-    # Each tip strays by less than half of what the nearest two leave free.
-    astray = 0.5 * room * np.sqrt(rng.random(fibres))[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+    # Each tip strays by less than half of what the nearest two leave free, and not so far that it would lie down.
+    astray = (
+        0.5
+        * min(room, 0.15 * length)
+        * np.sqrt(rng.random(fibres))[:, None]
+        * np.stack([np.cos(angle), np.sin(angle)], -1)
+    )
     tall = length * (1 - variation * rng.random(fibres))
     tall[0] = length
     vertices, normals = _fibres(feet, astray, tall, parameters)

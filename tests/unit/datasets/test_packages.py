@@ -67,6 +67,7 @@ def test_the_set_has_twelve_materials_and_more_that_can_be_built():
         assert one.difficulty.endswith(".")
 
 
+@pytest.mark.long
 def test_an_interrupted_run_ends_with_the_same_bytes(data, tmp_path):
     """Rationale: packages are resumed, and their bytes are what is published. Expected: wherever a run stops, the next
     one ends with the bytes of one that did not; nothing half done looks like a package.
