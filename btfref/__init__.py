@@ -20,6 +20,7 @@ from btfref.provenance import __version__
 
 if TYPE_CHECKING:
     from btfref.comparison import compare
+    from btfref.datasets.package import dataset
     from btfref.numerics.sphere.directions import DirectionSet
     from btfref.querying.batches import queries
     from btfref.rendering.gl.realtime import realtime
@@ -34,6 +35,7 @@ __all__ = [
     "SampledBTF",
     "__version__",
     "compare",
+    "dataset",
     "fit",
     "load",
     "queries",
@@ -48,6 +50,7 @@ _HOMES = {
     "DirectionSet": "btfref.numerics.sphere.directions",
     "SampledBTF": "btfref.sampling",
     "compare": "btfref.comparison",
+    "dataset": "btfref.datasets.package",
     "queries": "btfref.querying.batches",
     "realtime": "btfref.rendering.gl.realtime",
     "render": "btfref.rendering.offline.reference",

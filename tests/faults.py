@@ -100,6 +100,32 @@ def other(folder, patch):
     save(load(folder / "good.exr"), folder / "other.exr")
 
 
+def nothing(folder, patch):
+    """No fault but the command itself."""
+
+
+def strange_package(folder, patch):
+    """A file of somebody's where a package would be made."""
+    place = folder / "btfref-data/btf-1/toy/flat"
+    place.mkdir(parents=True)
+    (place / "mine.txt").write_text("mine")
+
+
+def one_row(folder, patch):
+    """A row for the board, with answers."""
+    np.save(folder / "flat.npy", np.zeros((9, 3), np.float32))
+    texts = {
+        "method": "m",
+        "setting": "",
+        "set": "btf-1",
+        "set_version": "1.0.0",
+        "tier": "toy",
+        "fitted": "none",
+    }
+    row = {"kind": "btfref-board-row", "schema": 1, **texts, "materials": {"flat": {"answers": "flat.npy"}}}
+    (folder / "mine.row.json").write_text(json.dumps(row))
+
+
 def locked(folder, patch):
     from btfref.sampling.store.lock import writing
 
@@ -405,6 +431,26 @@ ROWS = [
         "evaluate good.exr rows.queries.zarr -o rows.queries.zarr/x.npy",
         ("lies in",),
         prepare=some_rows,
+    ),
+    # 10
+    *(
+        Row("data sets", fault, command, words, prepare=prepare)
+        for fault, command, words, prepare in (
+            ("no such material", "dataset make silk", ("silk", "knit"), nothing),
+            ("no such set", "dataset make btf-9/knit", ("btf-9", "btf-1"), nothing),
+            ("nothing named", "dataset make", ("NAME", "all"), nothing),
+            ("another variant", "dataset make flat --variant cuda_ad_rgb", ("--variant",), nothing),
+            ("no packages", "dataset verify --folder none", ("no packages", "none"), nothing),
+            ("no package", "dataset card knit --folder none", ("no package", "knit"), nothing),
+            ("a file there", "dataset make flat --folder image.exr", ("--folder", "image.exr"), nothing),
+            ("other files there", "dataset make flat", ("other files", "mine.txt"), strange_package),
+            ("a plan wanted", "bench offgrid --dataset btf-1 -o out", ("--dataset",), nothing),
+            ("no folder for rows", "bench methods --dataset btf-1", ("-o",), nothing),
+            ("both kinds of data", "bench methods --dataset btf-1 --btf good.btf.zarr -o out", ("--btf",), nothing),
+            ("no such file", "board none -o site", ("none",), nothing),
+            ("no rows", "board image.exr -o site", ("image.exr", "JSON"), nothing),
+            ("no packages", "board mine.row.json -o site", ("no package", "flat"), one_row),
+        )
     ),
     Row("packages", "no such exporter", "export good.btf.zarr --format gone -o new", ("ubo", "utia", "bonn")),
     Row("ports", "a sampled BTF", f"{PORT.replace('.exr', '.btf.zarr')} new", ("good.btf.zarr",)),

@@ -20,13 +20,17 @@ COMMANDS = (
     "demand",
     "query",
     "evaluate",
+    "dataset",
     "validate",
     "bench",
+    "board",
     "stress",
 )
 
 #: Modules that do not stand in this folder under the command's name.
 ELSEWHERE = {
+    "board": "datasets.board",
+    "dataset": "datasets.dataset",
     "evaluate": "queries.evaluate",
     "import": "import_",  # a module cannot carry the name of a keyword
     "query": "queries.query",

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from btfref.bench import PICTURED, SUITES
 from btfref.bench.plan import SUFFIX, shipped
-from btfref.commands.shared.options import add_json, add_only, add_overwrite, words
+from btfref.commands.shared.options import add_data_folder, add_json, add_only, add_overwrite, words
 from btfref.commands.shared.printing import Progress, emit, emit_json, table
 from btfref.commands.shared.reading import output_file
 from btfref.errors import InputError
@@ -46,6 +46,13 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="raw results: a folder for plans (and for the report), a file to append a line to for suites",
     )
     parser.add_argument(
+        "--dataset",
+        metavar="SET",
+        help="fit a plan's methods to a standard data set (btf-1, or btf-1/MATERIAL), ask its test queries and write "
+        "rows for btfref board into -o FOLDER",
+    )
+    add_data_folder(parser)
+    parser.add_argument(
         "--plot", metavar="FILE.png", help="draw how the cost (suite synth) or the error (env) grows"
     )
     parser.add_argument(
@@ -61,8 +68,10 @@ def run(args: Namespace) -> int:
         return _compare(args) if args.suite == "compare" else _report(args)
     if args.folders:
         raise InputError("folders are for report and compare", field="FOLDER", got=args.folders[0])
+    if args.dataset and not (args.suite in shipped() or args.suite.endswith(SUFFIX)):
+        raise InputError("a data set is for plans", field="--dataset", got=args.suite, expected="methods")
     if args.suite in shipped() or args.suite.endswith(SUFFIX):
-        return _plan(args)
+        return _rows(args) if args.dataset else _plan(args)
     if args.suite in SUITES:
         return _suite(args)
     known = ", ".join([*shipped(), *sorted(SUITES), *READERS])
@@ -93,6 +102,27 @@ def _plan(args: Namespace) -> int:
         for line in table(lines, header=header):
             emit(line)
         emit()
+    return 0
+
+
+def _rows(args: Namespace) -> int:
+    from btfref.bench.plan import read_plan
+    from btfref.board.baselines import refuse_other_data, run
+    from btfref.datasets.sets import FOLDER
+
+    if not args.output:
+        raise InputError("rows of a board are files", field="-o", expected="a folder for them")
+    plan = read_plan(shipped().get(args.suite, args.suite), quick=args.quick, only=words(args.only))
+    refuse_other_data(plan, args.btf)
+    with Progress() as progress:
+        written = run(
+            plan, args.dataset, args.output, tier=args.tier, folder=args.folder or FOLDER, progress=progress
+        )
+    if args.json:
+        emit_json([str(path) for path in written])
+        return 0
+    for path in written:
+        emit(str(path))
     return 0
 
 

@@ -46,7 +46,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "mesostructure",
         metavar="MESO",
-        help="name of a mesostructure (checker, rings, tissue, flat), a mesh (PLY, OBJ, GLB, STL, OFF), a height "
+        help="name of a mesostructure (checker, rings, knit, pebbles, …), a mesh (PLY, OBJ, GLB, STL, OFF), a height "
         "map (PNG or TIFF of 8 or 16 bits, OpenEXR), or a folder of maps (*_Color, *_Displacement, *_NormalGL, …)",
     )
     parser.add_argument("-o", "--output", required=True, metavar="OUT.btf.zarr", help="the store to write")

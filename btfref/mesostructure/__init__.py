@@ -24,13 +24,26 @@ __all__ = ["MESOSTRUCTURES", "Mesostructure", "Part", "build", "names"]
 
 #: name -> "module:function", imported when asked for.
 MESOSTRUCTURES = {
+    "blisters": "btfref.mesostructure.bodies.blisters:blisters",
+    "brushed": "btfref.mesostructure.relief.brushed:brushed",
     "checker": "btfref.mesostructure.checker:checker",
+    "flakes": "btfref.mesostructure.bodies.flakes:flakes",
     "flat": "btfref.mesostructure.flat:flat",
+    "hammered": "btfref.mesostructure.relief.hammered:hammered",
     "height_map": "btfref.mesostructure.height_map:height_map",
+    "knit": "btfref.mesostructure.cloth.knit:knit",
+    "leather": "btfref.mesostructure.relief.leather:leather",
+    "mail": "btfref.mesostructure.bodies.mail:mail",
     "map_folder": "btfref.mesostructure.map_folder:map_folder",
     "mesh": "btfref.mesostructure.mesh:mesh",
+    "pebbles": "btfref.mesostructure.bodies.pebbles:pebbles",
+    "pile": "btfref.mesostructure.cloth.pile:pile",
+    "plaster": "btfref.mesostructure.relief.plaster:plaster",
     "rings": "btfref.mesostructure.rings:rings",
+    "satin": "btfref.mesostructure.cloth.weave:satin",
+    "specks": "btfref.mesostructure.bodies.specks:specks",
     "tissue": "btfref.mesostructure.tissue:tissue",
+    "twill": "btfref.mesostructure.cloth.weave:twill",
 }
 
 #: Mesostructures made from a user's file: name -> suffixes. A file's name stands for them.

@@ -12,7 +12,8 @@ import numpy as np
 
 from btfref.errors import InputError
 from btfref.mesostructure.base import Mesostructure, Part, square_below
-from btfref.mesostructure.checks import colour, number, sweep_faces, whole
+from btfref.mesostructure.bodies.shapes import torus, torus_faces
+from btfref.mesostructure.checks import colour, number, whole
 
 
 def rings(
@@ -77,8 +78,8 @@ def rings(
     for index in range(count):
         # Radii at odd multiples of half a spacing, so that neighbouring tiles continue the pattern.
         radius = (2 * index + 2) / (4 * count + 2)
-        ring, normal = _torus(radius, wire, segments, sides)
-        faces.append(sweep_faces(segments + 1, sides) % (segments * sides) + index * segments * sides)
+        ring, normal = torus(radius, wire, segments, sides, [0.5, 0.5, -wire])
+        faces.append(torus_faces(segments, sides) + index * segments * sides)
         vertices.append(ring)
         normals.append(normal)
     gold = {"type": "roughconductor", "material": material, "distribution": "ggx", "alpha": roughness}
@@ -104,13 +105,3 @@ def rings(
         "base_roughness": base_roughness,
     }
     return Mesostructure("rings", parameters, parts)
-
-
-def _torus(radius: float, wire: float, segments: int, sides: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and normals of a ring that touches z = 0 from below, around the middle of the tile."""
-    along = 2 * np.pi * np.arange(segments)[:, None] / segments
-    around = 2 * np.pi * np.arange(sides)[None, :] / sides
-    out = np.stack(np.broadcast_arrays(np.cos(along), np.sin(along), 0.0), -1)
-    normal = np.cos(around)[..., None] * out + np.sin(around)[..., None] * np.array([0.0, 0.0, 1.0])
-    centre = np.array([0.5, 0.5, -wire]) + radius * out
-    return (centre + wire * normal).reshape(-1, 3), normal.reshape(-1, 3)

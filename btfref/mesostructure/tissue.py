@@ -7,19 +7,13 @@ functions* (Eurographics 2003); its dimensions are not given there, those here a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from btfref.errors import InputError
 from btfref.mesostructure.base import Mesostructure, Part, square_below
-from btfref.mesostructure.checks import colour, number, sweep_faces, whole
-
-if TYPE_CHECKING:
-    from btfref.types import Facts
-
-#: Smallest clearance between two yarns, in half thicknesses: far above what facets take off.
-_CLEARANCE = 0.02
+from btfref.mesostructure.checks import colour, number, whole
+from btfref.mesostructure.cloth.weave import refuse_meeting
+from btfref.mesostructure.cloth.yarns import fibre, upright_tubes
 
 
 def tissue(
@@ -85,34 +79,15 @@ def tissue(
     if backing_colour is not None:
         backing_colour = colour("tissue", "backing_colour", backing_colour)
 
-    across = np.linspace(0.0, 1.0, 1025)
-    rest = 2 * amplitude / thickness * np.cos(0.5 * np.pi * width * across) - np.sqrt(1 - across**2)
-    if rest.min() < _CLEARANCE:
-        raise InputError(
-            "yarns would meet",
-            field="amplitude",
-            got=amplitude,
-            expected="a larger one, or narrower or thinner yarns",
-        )
-
-    def fibre(base: Sequence[float]) -> Facts:
-        return {
-            "type": "principled",
-            "base_color": {"type": "rgb", "value": base},
-            "roughness": roughness,
-            "anisotropic": anisotropy,
-            "sheen": sheen,
-            "sheen_tint": 0.5,
-            "specular": 0.4,
-        }
-
+    refuse_meeting(width, thickness, amplitude)
+    look = roughness, anisotropy, sheen
     warp = _yarns(count, width, thickness, amplitude, segments, sides)
     vertices, normals, uv, faces = warp
     # Mirrored in the plane x = y, and turned over: where the warp is up, the weft is down.
     turn = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]], np.float64)
     parts = [
-        Part(vertices, faces, fibre(warp_colour), normals=normals, uv=uv),
-        Part(vertices @ turn.T, faces, fibre(weft_colour), normals=normals @ turn.T, uv=uv),
+        Part(vertices, faces, fibre(warp_colour, *look), normals=normals, uv=uv),
+        Part(vertices @ turn.T, faces, fibre(weft_colour, *look), normals=normals @ turn.T, uv=uv),
     ]
     top = max(part.vertices[:, 2].max() for part in parts)
     parts = [
@@ -144,29 +119,11 @@ def _yarns(
     count: int, width: float, thickness: float, amplitude: float, segments: int, sides: int
 ) -> tuple[np.ndarray, ...]:
     """Warp yarns: vertices, normals, texture coordinates (u along the yarn) and faces, z around 0."""
-    n_along = segments + 1
-    x = np.arange(n_along) / segments
     # The last ring of vertices is the first one of the next tile, bit for bit.
-    phase = np.pi * count * (np.arange(n_along) % segments) / segments
-    around = -2 * np.pi * np.arange(sides) / sides
-    half_width, half_thickness = 0.5 * width / count, 0.5 * thickness
-    vertices, normals, uv, faces = [], [], [], []
-    for index in range(count):
-        sign = 1 if index % 2 == 0 else -1
-        # Extremes at the crossings x = (j + 1/2)/count: a sine of that phase.
-        height = sign * amplitude * np.sin(phase)
-        slope = sign * amplitude * np.pi * count * np.cos(phase)
-        y = (index + 0.5) / count + half_width * np.cos(around)
-        z = height[:, None] + half_thickness * np.sin(around)
-        ring = np.stack(np.broadcast_arrays(x[:, None], y[None, :], z), -1)
-        # Sections stay upright (a sheared sweep), so the normal is that of the section, tilted by the slope.
-        across = np.cos(around) / half_width
-        up = np.sin(around) / half_thickness
-        normal = np.stack(np.broadcast_arrays(-slope[:, None] * up, across, up), -1)
-        normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
-        vertices.append(ring.reshape(-1, 3))
-        normals.append(normal.reshape(-1, 3))
-        texture = np.broadcast_arrays(x[:, None], np.arange(sides)[None, :] / sides)
-        uv.append(np.stack(texture, -1).reshape(-1, 2))
-        faces.append(sweep_faces(n_along, sides) + index * n_along * sides)
-    return tuple(np.concatenate(parts) for parts in (vertices, normals, uv, faces))
+    phase = np.pi * count * (np.arange(segments + 1) % segments) / segments
+    sign = np.where(np.arange(count) % 2 == 0, 1, -1)[:, None]
+    # Extremes at the crossings x = (j + 1/2)/count: a sine of that phase.
+    height = sign * amplitude * np.sin(phase)
+    slope = sign * amplitude * np.pi * count * np.cos(phase)
+    y = (np.arange(count) + 0.5) / count
+    return upright_tubes(height, slope, y, 0.5 * width / count, 0.5 * thickness, sides)

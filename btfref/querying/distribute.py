@@ -77,6 +77,7 @@ def _write(path: Path, job: QueryJob) -> None:
             "btfref": __version__,
             "versions": job.attributes["versions"],
             "settings": settings,
+            "stream": job.stream,
             "mesostructure": mesostructure_facts(job.source),
         },
     )
@@ -96,7 +97,9 @@ def read_order(path: Path) -> QueryJob:
 
     try:
         data = read_facts(path)
-        job = QueryJob(mesostructure_of(data["mesostructure"]), QuerySettings(**data["settings"]))
+        job = QueryJob(
+            mesostructure_of(data["mesostructure"]), QuerySettings(**data["settings"]), stream=data["stream"]
+        )
     except (ValueError, KeyError, TypeError) as error:
         if isinstance(error, InputError):
             raise

@@ -45,20 +45,26 @@ class QueryJob:
     ----------
     source : Mesostructure or Representation
     settings : QuerySettings
-    name : str
+    facts : dict, optional
         Of the source, as a file says it.
+    stream : int
+        Selects other random numbers for the same rows, of geometry.
 
     Attributes
     ----------
-    source, settings
+    source, settings, stream
     attributes : dict
         Of the file.
     """
 
     def __init__(
-        self, source: Mesostructure | Representation, settings: QuerySettings, facts: Facts | None = None
+        self,
+        source: Mesostructure | Representation,
+        settings: QuerySettings,
+        facts: Facts | None = None,
+        stream: int = 0,
     ) -> None:
-        self.source, self.settings = source, settings
+        self.source, self.settings, self.stream = source, settings, stream
         if isinstance(source, Mesostructure):
             with mitsuba_variant(settings.variant):
                 for part in source.parts:
@@ -73,6 +79,8 @@ class QueryJob:
             "source": facts or _representation_facts(source),  # type: ignore[arg-type]  # it is one
             "versions": versions(used),
         }
+        if stream:  # files of the first do without
+            self.attributes["stream"] = stream
 
     @classmethod
     def of(
@@ -80,8 +88,12 @@ class QueryJob:
         source: PathLike | Mesostructure | Representation,
         settings: QuerySettings | None = None,
         keywords: Facts | None = None,
+        *,
+        stream: int = 0,
     ) -> QueryJob:
         """The job of a source by its name or file, and of keywords that are settings or the mesostructure's.
+
+        Other streams ask the same rows of geometry, and answer them by other random numbers.
 
         Raises
         ------
@@ -89,7 +101,7 @@ class QueryJob:
         """
         settings, parameters = (settings or QuerySettings()).changed(keywords or {})
         if isinstance(source, Mesostructure):
-            return cls(build(source, **parameters), settings)
+            return cls(build(source, **parameters), settings, stream=stream)
         if isinstance(source, Representation):
             return cls(_without(source, parameters), settings)
         if is_answering_file(source):
@@ -97,7 +109,7 @@ class QueryJob:
             return cls(_without(load_source(source), parameters), settings, facts)
         with mitsuba_variant(settings.variant):  # whose absence is told before geometry is read
             pass
-        return cls(build(source, **parameters), settings)
+        return cls(build(source, **parameters), settings, stream=stream)
 
     @contextmanager
     def ready(self) -> Iterator[None]:
@@ -108,16 +120,16 @@ class QueryJob:
         else:
             yield
 
-    def make_source(self, stream: int = 0) -> Source:
+    def make_source(self, stream: int | None = None) -> Source:
         """What answers; make and use it inside :meth:`ready`.
 
         Parameters
         ----------
-        stream : int
-            Selects other random numbers for the same rows, of geometry.
+        stream : int, optional
+            In place of the job's.
         """
         if isinstance(self.source, Mesostructure):
-            return PathSource(self.source, self.settings, stream)
+            return PathSource(self.source, self.settings, self.stream if stream is None else stream)
         return LookupSource(self.source, self.settings)
 
     def rows(self, source: Source, first: int, count: int) -> dict[str, np.ndarray]:

@@ -68,7 +68,7 @@ def _compare(llvm, name, estimator, n_pairs, rounds):
 
 @pytest.mark.long
 @pytest.mark.parametrize("estimator", ["path", "surface"])
-@pytest.mark.parametrize("name", ["checker", "rings", "tissue"])
+@pytest.mark.parametrize("name", ["checker", "rings", "tissue", "knit", "leather", "pebbles"])
 def test_thirty_pairs_equal_plain_renders(llvm, name, estimator):
     rejected, bias, error = _compare(llvm, name, estimator, 30, ROUNDS)
     assert rejected <= tolerance("closing_loop.difference.rejected_fraction")

@@ -14,6 +14,7 @@ FLOORS = """
 btfref.__main__ btfref.docs
 btfref.cli
 btfref.commands btfref.pytest_plugin
+btfref.board
 btfref.bench btfref.demo btfref.testing btfref.view
 btfref.report
 btfref.validate
@@ -21,6 +22,7 @@ btfref.stress
 btfref
 btfref.rendering
 btfref.scene
+btfref.datasets
 mitsuba_plugins btfref.formats btfref.querying
 btfref.representations
 btfref.sampling

@@ -38,7 +38,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "source",
         metavar="SOURCE",
-        help="what synth takes (checker, rings, tissue, flat, a mesh, a height map, a folder of maps), a sampled BTF "
+        help="what synth takes (checker, rings, knit, …, a mesh, a height map, a folder of maps), a sampled BTF "
         "(.btf.zarr) or a representation (.exr)",
     )
     parser.add_argument(

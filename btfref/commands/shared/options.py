@@ -117,6 +117,19 @@ def add_memory(
     parser.add_argument("--memory", type=memory_size, metavar="SIZE", help=text)
 
 
+def add_data_folder(parser: _ActionsContainer, *, tier: bool = True) -> None:
+    """``--folder`` of a standard data set's packages, None for the default, and ``--tier``."""
+    if tier:
+        parser.add_argument(
+            "--tier", default="toy", metavar="TIER", help="toy, standard or large (default %(default)s)"
+        )
+    parser.add_argument(
+        "--folder",
+        metavar="FOLDER",
+        help="where packages of data sets lie (default btfref-data)",
+    )
+
+
 def add_json(parser: _ActionsContainer, what: str) -> None:
     """``--json``: print `what` for programs."""
     parser.add_argument("--json", action="store_true", help=f"print {what} as JSON")

@@ -1,0 +1,1 @@
+"""The commands of standard data sets and of the board of methods on them."""

@@ -1,0 +1,1 @@
+"""Closed bodies over a plane: rings, grains, blisters and plates."""

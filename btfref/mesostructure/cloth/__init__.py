@@ -1,0 +1,1 @@
+"""Yarns and fibres: tubes that cross, loop or stand."""

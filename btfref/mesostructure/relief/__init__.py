@@ -1,0 +1,1 @@
+"""Height fields without overhang: one periodic grid of heights each."""
