@@ -227,6 +227,13 @@ _ROWS = (
         fit="gbrdf.decomposition.pipeline",
         editing="gbrdf.maps",
     ),
+    _row(
+        "neural",
+        "Latent texture and a small network",
+        "Rainer, Jakob, Ghosh, Weyrich 2019, Kuznetsov et al. 2021",
+        "neural.definition",
+        fit="neural.fit",
+    ),
 )
 
 
