@@ -74,8 +74,7 @@ class Fits:
         with open(self._directory / f"{kind}.{key}.lock", "w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)  # released when the file is closed
             if not kept.exists():
-                row = method(key)
-                made = row.fit(self.btf(kind), **row.presets.get("quick", {}))
+                made = method(key).quick_fit(self.btf(kind))
                 save(made, self._directory / f"{kind}.{key}.exr")
                 kept.write_bytes(pickle.dumps(made))
                 return made

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from btfref import conventions
-from btfref.precision import precision, real
+from btfref.precision import real
 from btfref.representations.analytic.light_functions import EDGES, held
 from btfref.representations.file.schema import MapSchema, Range, Schema
 from btfref.representations.guide import feature_views, spread_members, texel_groups

@@ -37,8 +37,11 @@ FIT_MEMORY = FitMemory(2.4, 200 << 20)
 #: "paper": all numbers in floats. "quick": a few steps, to try things out.
 PRESETS: dict[str, Facts] = {"paper": {"storage": "float"}, "quick": {"hidden": 16, "passes": 2}}
 
-#: Texels a side, and pairs of directions, of a step.
-SIDE, PAIRS = 16, 32
+#: Texels a side of a step, at most, and pairs of directions; few texels see more pairs, so that a step is worth it.
+SIDE, PAIRS, MOST_PAIRS = 8, 32, 128
+
+#: Lookups of a step, at least.
+BATCH = 2048
 
 #: Steps of Adam at the start, for the matrices and for the texels; they fall to 0 as a cosine.
 STEP, TEXEL_STEP = 0.005, 0.02
@@ -67,7 +70,9 @@ class Adam:
         self.mean, self.square = np.zeros_like(self.value), np.zeros_like(self.value)
         self.count = np.zeros((*self.value.shape[:-1], 1))
 
-    def step(self, gradient: np.ndarray, share: float, at: tuple[np.ndarray, ...] | slice = slice(None)) -> None:
+    def step(
+        self, gradient: np.ndarray, share: float, at: tuple[np.ndarray, ...] | slice = slice(None)
+    ) -> None:
         """Go against a gradient, that of the items ``at``, by a ``share`` of the rate."""
         self.count[at] += 1
         count = self.count[at]
@@ -80,7 +85,7 @@ class Adam:
 
 @dataclass(frozen=True)
 class Samples:
-    """Data of a step: half-open windows of texels under pairs of directions."""
+    """What steps read: values by pair of directions, row and column, and what is known of the pairs."""
 
     values: np.ndarray
     codes: np.ndarray
@@ -126,7 +131,9 @@ class Window:
         parts = [items[row, column] * weight for row, column, weight in self.corners()]
         return sum(parts[1:], parts[0])
 
-    def gathered(self, slopes: np.ndarray, texels: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def gathered(
+        self, slopes: np.ndarray, texels: tuple[int, int]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The transpose of :meth:`moved`: the items' slopes, and their rows and columns, each of them once."""
         rows, columns = self.rows, self.columns
         result = np.zeros((len(rows), len(columns), slopes.shape[-1]), np.float32)
@@ -275,15 +282,16 @@ def _descend(
     pairs, texels = len(samples.values), samples.texels
     if samples.scale == 0:
         return 0
-    seen = min(SIDE, texels[0]) * min(SIDE, texels[1]) * min(PAIRS, pairs)
-    steps = max(1, round(passes * pairs * texels[0] * texels[1] / seen))
+    lookups = min(SIDE, texels[0]) * min(SIDE, texels[1])
+    width = min(pairs, max(PAIRS, min(MOST_PAIRS, BATCH // lookups)))
+    steps = max(1, round(passes * pairs * texels[0] * texels[1] / (lookups * width)))
     own = Adam(latent, TEXEL_STEP)
     shared = {name: Adam(layer, STEP) for name, layer in layers.items()}
     order = np.zeros(0, int)
     for step in range(steps):
-        if len(order) < PAIRS:
+        if len(order) < width:
             order = np.concatenate([order, rng.permutation(pairs)])
-        chosen, order = order[:PAIRS], order[PAIRS:]
+        chosen, order = order[:width], order[width:]
         window = _window(rng, texels, samples.bilinear)
         here = latent[np.ix_(window.rows, window.columns)]
         moved = window.moved(here).reshape(-1, latent.shape[-1])
@@ -291,8 +299,8 @@ def _descend(
         slope = _slope(y, _targets(samples, chosen, window), samples.cosine[chosen], samples.scale)
         by_texel, by_layer = network.backward(tape, slope, layers)
         share = 0.5 * (1 + math.cos(math.pi * step / steps))
-        lookups = len(window.rows) - 1, len(window.columns) - 1
-        gradient, rows, columns = window.gathered(by_texel.reshape(*lookups, -1), texels)
+        shape = len(window.rows) - 1, len(window.columns) - 1, latent.shape[-1]
+        gradient, rows, columns = window.gathered(by_texel.reshape(shape), texels)
         own.step(gradient, share, np.ix_(rows, columns))
         for name, adam in shared.items():
             adam.step(by_layer[name], share)
