@@ -103,7 +103,7 @@ class Method:
 
     @property
     def presets(self) -> dict[str, Facts]:
-        """Named settings of ``fit``; "paper" has those of the method's paper, "quick" what checks take for their fits."""
+        """Named settings of ``fit``; "paper": those of the method's paper; "quick": what checks take for their fits."""
         return self.fitting.PRESETS
 
     @property
