@@ -26,6 +26,7 @@ class Evaluator(Port):
         """Take over changed maps."""
         self.latent, self.width = as_float32(maps.tensors["latent"]), maps.tensors["latent"].shape[-1]
         self.hidden = maps.tensors["layer_2"].shape[0]
+        self.scale = as_float32(maps.tensors["scale"])
         self.layers = [as_float32(maps.tensors[name]) for name in LAYERS]
 
     def evaluate(self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray) -> JitArray:
@@ -45,7 +46,8 @@ class Evaluator(Port):
         colour = [
             dr.exp2(dr.clip(e + b, LOWEST, HIGHEST)) for e, b in zip(exponents[:3], numbers, strict=False)
         ]
-        return mi.Color3f(*colour) * (self.constants["scale"] * w_light.z)
+        scale = read_packets(self.scale, mi.UInt32(0), 4, active)
+        return mi.Color3f(*colour) * mi.Color3f(*(mi.Float(s) for s in scale[:3])) * w_light.z
 
     def _numbers(self, uv: JitArray, active: JitArray) -> list[JitArray]:
         """The numbers of the texels around a lookup, interpolated."""

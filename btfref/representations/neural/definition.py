@@ -27,7 +27,7 @@ import numpy as np
 from btfref import conventions
 from btfref.precision import real
 from btfref.representations.analytic.light_functions import EDGES, held
-from btfref.representations.file.schema import MapSchema, Range, Schema
+from btfref.representations.file.schema import MapSchema, Schema
 from btfref.representations.guide import feature_views, spread_members, texel_groups
 from btfref.representations.lookup import StoredMaps, evaluate_points
 from btfref.representations.neural import network
@@ -52,8 +52,8 @@ BLOCK = 64
 class Representation(StoredMaps):
     """``latent`` [row, column, 4 · hidden + 3], ``layer_1`` [12, hidden], ``layer_2``, ``layer_3`` and directions.
 
-    ``layer_2`` is [hidden, hidden], ``layer_3`` [hidden, 3]. The channels of ``latent``: gains and biases of the first
-    hidden layer, gains and biases of the second one, biases of the colours.
+    ``layer_2`` is [hidden, hidden], ``layer_3`` [hidden, 3]; ``scale`` [1, 3] is a colour. The channels of ``latent``:
+    gains and biases of the first hidden layer, gains and biases of the second one, biases of the colours.
     """
 
     @classmethod
@@ -66,7 +66,8 @@ class Representation(StoredMaps):
             "layer_3": "4*quads 3",
         }
         maps = {name: MapSchema(text, least=-LARGEST, most=LARGEST) for name, text in axes.items()}
-        return Schema(maps, EDGES | {"scale": Range(0.0, 1e12)})
+        maps["scale"] = MapSchema("1 3", least=0)
+        return Schema(maps, EDGES)
 
     def evaluate(
         self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
@@ -75,6 +76,7 @@ class Representation(StoredMaps):
         constants, meta = self.meta["constants"], self.meta
         latent = self.maps["latent"].reshape(-1, self.maps["latent"].shape[-1])
         layers = {name: real(self.maps[name]) for name in network.LAYERS}
+        scale = real(self.maps["scale"][0])
 
         def lookup(uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray) -> np.ndarray:
             texel, weight = conventions.texel_stencil(uv, meta["texels"], meta["filter_type"])
@@ -82,7 +84,7 @@ class Representation(StoredMaps):
             light, _ = held(w_light, constants["light_edge"])
             view, _ = held(w_view, constants["view_edge"])
             y = network.exponents(own, network.code(light, view), layers)
-            return network.values(y, w_light[:, 2], constants["scale"])
+            return network.values(y, w_light[:, 2], scale)
 
         return evaluate_points(lookup, uv, w_light, w_view, gathered=4 * latent.shape[-1])
 
@@ -105,7 +107,7 @@ class Representation(StoredMaps):
         for start in range(0, len(texels), BLOCK):
             part = slice(start, start + BLOCK)
             y, _ = network.forward(latent[texels[part]].astype(np.float32), codes, layers)
-            found = network.values(y, cosine, self.meta["constants"]["scale"])
+            found = network.values(y, cosine, self.maps["scale"][0].astype(np.float32))
             result[part] = conventions.luminance(found).reshape(-1, *pairs)
         return result
 

@@ -16,6 +16,7 @@ import numpy as np
 from btfref.errors import InputError
 from btfref.numerics.solvers.threads import reproducible
 from btfref.representations.analytic.light_functions import edge_constants
+from btfref.representations.file.schema import LARGEST
 from btfref.representations.lookup import (
     base_meta,
     direction_arrays,
@@ -44,7 +45,7 @@ SIDE, PAIRS, MOST_PAIRS = 8, 32, 128
 BATCH = 2048
 
 #: Steps of Adam at the start, for the matrices and for the texels; they fall to 0 as a cosine.
-STEP, TEXEL_STEP = 0.005, 0.02
+STEP, TEXEL_STEP = 0.01, 0.01
 
 #: Adam's means of gradients and of their squares (Kingma and Ba 2015).
 MEAN, SQUARE = 0.9, 0.99
@@ -90,7 +91,7 @@ class Samples:
     values: np.ndarray
     codes: np.ndarray
     cosine: np.ndarray
-    scale: float
+    scale: np.ndarray
     bilinear: bool
 
     @property
@@ -150,12 +151,10 @@ class Window:
 
 
 def _window(rng: np.random.Generator, texels: tuple[int, int], bilinear: bool) -> Window:
-    first = [int(rng.integers(n)) for n in texels]
-    rows, columns = (
-        (start + np.arange(min(SIDE, n) + 1)) % n for start, n in zip(first, texels, strict=True)
-    )
-    way = tuple(float(x) for x in rng.random(2))
-    return Window(rows, columns, way if bilinear else (0.0, 0.0))
+    """A window anywhere in the texture."""
+    rows, columns = ((int(rng.integers(n)) + np.arange(min(SIDE, n) + 1)) % n for n in texels)
+    down, right = rng.random(2)
+    return Window(rows, columns, (float(down), float(right)) if bilinear else (0.0, 0.0))
 
 
 @reproducible()
@@ -214,9 +213,11 @@ def fit(
     steps = _descend(samples, latent, layers, rng, float(passes), progress or (lambda *_: None))
     maps = {"latent": stored("latent", latent, storage)}
     maps |= {name: stored(name, layer, storage) for name, layer in layers.items()}
+    # A colour of any magnitude: always in float32.
+    maps["scale"] = samples.scale[None]
     parameters = {"hidden": hidden, "passes": float(passes), "storage": storage, "seed": seed}
     meta = base_meta("neural", btf, parameters, filter_type=filter_type)
-    meta["constants"] = edge_constants(btf) | {"scale": samples.scale}
+    meta["constants"] = edge_constants(btf)
     meta["fit"] = {"steps": steps} | _judged(samples, maps)
     return Representation(maps | direction_arrays(btf.views, btf.lights), meta)
 
@@ -225,16 +226,16 @@ def _samples(btf: SampledBTF, bilinear: bool) -> Samples:
     """What steps read of a BTF."""
     views, lights = btf.views.vectors, btf.lights.vectors
     pairs = len(views), len(lights)
-    total = 0.0
+    total = np.zeros(3)
     for values in btf.values:
         refuse_not_finite(values, btf)
-        total += float(np.maximum(values, 0).sum(dtype=float))
-    mean, cosine = total / btf.values.size, float(lights[:, 2].mean())
+        total += np.maximum(values, 0).sum((0, 1, 2), dtype=float)
+    mean, cosine = total / (btf.values.size / 3), float(lights[:, 2].mean())
     return Samples(
         btf.values.reshape(pairs[0] * pairs[1], *btf.values.shape[2:]),
         network.code(np.tile(lights, (pairs[0], 1)), np.repeat(views, pairs[1], 0)).astype(np.float32),
         np.tile(lights[:, 2], pairs[0]).astype(np.float32),
-        float(np.float32(min(mean / max(cosine, 1e-3), 1e12))),
+        np.minimum(mean / max(cosine, 1e-3), LARGEST).astype(np.float32),
         bilinear,
     )
 
@@ -280,7 +281,7 @@ def _descend(
 ) -> int:
     """Change the texels and the matrices in place; the number of steps."""
     pairs, texels = len(samples.values), samples.texels
-    if samples.scale == 0:
+    if not samples.scale.any():
         return 0
     lookups = min(SIDE, texels[0]) * min(SIDE, texels[1])
     width = min(pairs, max(PAIRS, min(MOST_PAIRS, BATCH // lookups)))
@@ -316,9 +317,9 @@ def _targets(samples: Samples, chosen: np.ndarray, window: Window) -> np.ndarray
     return np.maximum(moved, 0).reshape(-1, len(chosen), 3)
 
 
-def _slope(y: np.ndarray, targets: np.ndarray, cosine: np.ndarray, scale: float) -> np.ndarray:
+def _slope(y: np.ndarray, targets: np.ndarray, cosine: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """Derivative of the mean loss by the exponents, shape (texels, pairs, 3)."""
-    unit = np.float32(1 / (OFFSET * scale))
+    unit = np.float32(1 / (OFFSET * float(scale.mean())))
     found = network.values(y, cosine[None], scale) * unit
     difference = np.log1p(found) - np.log1p(targets * unit)
     # tanh: the absolute error, rounded where it is small.

@@ -82,9 +82,9 @@ def exponents(latent: np.ndarray, codes: np.ndarray, layers: Mapping[str, np.nda
     return x @ layers["layer_3"] + colour
 
 
-def values(y: np.ndarray, cosine: np.ndarray, scale: float) -> np.ndarray:
-    """B of exponents: ``scale · cos θ_light · 2^y``, shapes (..., 3), (...) -> (..., 3)."""
-    return np.exp2(np.clip(y, LOWEST, HIGHEST)) * (cosine * cosine.dtype.type(scale))[..., None]
+def values(y: np.ndarray, cosine: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """B of exponents: ``scale · cos θ_light · 2^y``, shapes (..., 3), (...), (3,) -> (..., 3)."""
+    return np.exp2(np.clip(y, LOWEST, HIGHEST)) * (cosine[..., None] * scale)
 
 
 @dataclass
