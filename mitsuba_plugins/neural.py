@@ -26,7 +26,7 @@ class Evaluator(Port):
         """Take over changed maps."""
         self.latent, self.width = as_float32(maps.tensors["latent"]), maps.tensors["latent"].shape[-1]
         self.hidden = maps.tensors["layer_2"].shape[0]
-        self.scale = as_float32(maps.tensors["scale"])
+        self.scale = as_float32(maps.tensors["colour_scale"])
         self.layers = [as_float32(maps.tensors[name]) for name in LAYERS]
 
     def evaluate(self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray) -> JitArray:

@@ -1,5 +1,5 @@
 // Provides btf_eval of a latent texture and a small network.
-// Expects latent [row, column, 4 hidden + 3], layer_1 [12, hidden], layer_2 [hidden, hidden], layer_3 [hidden, 3], scale [1, 3], the edges.
+// Expects latent [row, column, 4 hidden + 3], layer_1 [12, hidden], layer_2 [hidden, hidden], layer_3 [hidden, 3], colour_scale [1, 3], the edges.
 
 #include "lib/lookup/directions.glsl"
 #include "lib/lookup/halfway.glsl"
@@ -11,7 +11,7 @@ uniform sampler2DArray latent;
 uniform sampler2DArray layer_1;
 uniform sampler2DArray layer_2;
 uniform sampler2DArray layer_3;
-uniform sampler2DArray scale;
+uniform sampler2DArray colour_scale;
 
 // Units of a hidden layer in fours.
 const int QUADS = LAYER_2_DIM0 / 4;
@@ -66,5 +66,5 @@ vec3 btf_eval(vec2 uv, vec3 w_light, vec3 w_view, float lod) {
         y += four_rows(layer_3, 4 * k, 1, second).rgb;
     }
     y = clamp(y, -20.0, 20.0);
-    return table_fetch(scale, 0).rgb * w_light.z * vec3(exp2_accurate(y.x), exp2_accurate(y.y), exp2_accurate(y.z));
+    return table_fetch(colour_scale, 0).rgb * w_light.z * vec3(exp2_accurate(y.x), exp2_accurate(y.y), exp2_accurate(y.z));
 }

@@ -52,7 +52,7 @@ BLOCK = 64
 class Representation(StoredMaps):
     """``latent`` [row, column, 4 · hidden + 3], ``layer_1`` [12, hidden], ``layer_2``, ``layer_3`` and directions.
 
-    ``layer_2`` is [hidden, hidden], ``layer_3`` [hidden, 3]; ``scale`` [1, 3] is a colour. The channels of ``latent``:
+    ``layer_2`` is [hidden, hidden], ``layer_3`` [hidden, 3]; ``colour_scale`` is [1, 3]. The channels of ``latent``:
     gains and biases of the first hidden layer, gains and biases of the second one, biases of the colours.
     """
 
@@ -66,7 +66,7 @@ class Representation(StoredMaps):
             "layer_3": "4*quads 3",
         }
         maps = {name: MapSchema(text, least=-LARGEST, most=LARGEST) for name, text in axes.items()}
-        maps["scale"] = MapSchema("1 3", least=0)
+        maps["colour_scale"] = MapSchema("1 3", least=0)
         return Schema(maps, EDGES)
 
     def evaluate(
@@ -76,7 +76,7 @@ class Representation(StoredMaps):
         constants, meta = self.meta["constants"], self.meta
         latent = self.maps["latent"].reshape(-1, self.maps["latent"].shape[-1])
         layers = {name: real(self.maps[name]) for name in network.LAYERS}
-        scale = real(self.maps["scale"][0])
+        scale = real(self.maps["colour_scale"][0])
 
         def lookup(uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray) -> np.ndarray:
             texel, weight = conventions.texel_stencil(uv, meta["texels"], meta["filter_type"])
@@ -107,7 +107,7 @@ class Representation(StoredMaps):
         for start in range(0, len(texels), BLOCK):
             part = slice(start, start + BLOCK)
             y, _ = network.forward(latent[texels[part]].astype(np.float32), codes, layers)
-            found = network.values(y, cosine, self.maps["scale"][0].astype(np.float32))
+            found = network.values(y, cosine, self.maps["colour_scale"][0].astype(np.float32))
             result[part] = conventions.luminance(found).reshape(-1, *pairs)
         return result
 

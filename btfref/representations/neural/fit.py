@@ -179,9 +179,9 @@ def fit(
     progress : callable, optional
         ``progress(done, total, label)``.
     hidden : int
-        Units of each of the two hidden layers, a multiple of 4; a texel has ``4 · hidden + 3`` numbers.
+        Units of each of the two hidden layers, at least 4 and a multiple of 4; a texel has ``4 · hidden + 3`` numbers.
     passes : float
-        How many times each sample is seen on average; time is in proportion.
+        How many times each sample is seen on average, above 0; time is in proportion.
     storage : {"half", "float"}
         Type of the stored maps.
     filter_type : {"bilinear", "nearest"}
@@ -214,7 +214,7 @@ def fit(
     maps = {"latent": stored("latent", latent, storage)}
     maps |= {name: stored(name, layer, storage) for name, layer in layers.items()}
     # A colour of any magnitude: always in float32.
-    maps["scale"] = samples.scale[None]
+    maps["colour_scale"] = samples.scale[None]
     parameters = {"hidden": hidden, "passes": float(passes), "storage": storage, "seed": seed}
     meta = base_meta("neural", btf, parameters, filter_type=filter_type)
     meta["constants"] = edge_constants(btf)

@@ -136,7 +136,7 @@ def test_parameters_out_of_range_are_refused(parameters, field):
         (lambda maps, meta: maps.update(latent=maps["latent"][..., :-1]), "latent"),
         (lambda maps, meta: maps.update(layer_2=maps["layer_2"].astype(np.float32) + 1e5), "layer_2"),
         (lambda maps, meta: maps.pop("layer_2"), "layer_2"),
-        (lambda maps, meta: maps.update(scale=-maps["scale"]), "scale"),
+        (lambda maps, meta: maps.update(scale=-maps["colour_scale"]), "colour_scale"),
         (lambda maps, meta: meta["constants"].update(light_edge=0.5), "light_edge"),
     ],
 )
@@ -164,7 +164,7 @@ def test_the_port_passes_derivatives_of_every_map(tmp_path, need):
     points = rng.random((64, 2)), hemisphere(rng, 64, float), hemisphere(rng, 64, float)
     bsdf = mitsuba_plugins.load(path)
     maps, port = bsdf.maps, bsdf.evaluator
-    names = ("latent", *network.LAYERS, "scale")
+    names = ("latent", *network.LAYERS, "colour_scale")
     for name in names:
         dr.enable_grad(maps.tensors[name])
     port.update(maps)
