@@ -85,6 +85,7 @@ SETTINGS = {
     },
     "hf": {"map_size": 6, "clusters": 3},
     "gbrdf": {"ndf_size": 8},
+    "neural": {"hidden": 4, "passes": 1.0},
     "rf_lobes": {"lobes": 1},
     "lafortune": {"lobes": 1},
     "lafortune_lut": {"lobes": 1},

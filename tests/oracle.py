@@ -38,7 +38,9 @@ SHAPE, FEW = (16, 12), (8, 6)
 
 
 class Fits:
-    """Every method fitted once to each kind of table, with its defaults; shared by all tests and workers of a run.
+    """Every method fitted once to each kind of table, with its defaults or, where it has one, its preset "quick".
+
+    Shared by all tests and workers of a run.
 
     Parameters
     ----------
@@ -72,7 +74,7 @@ class Fits:
         with open(self._directory / f"{kind}.{key}.lock", "w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)  # released when the file is closed
             if not kept.exists():
-                made = method(key).fit(self.btf(kind))
+                made = method(key).quick_fit(self.btf(kind))
                 save(made, self._directory / f"{kind}.{key}.exr")
                 kept.write_bytes(pickle.dumps(made))
                 return made

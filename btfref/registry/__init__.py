@@ -97,9 +97,13 @@ class Method:
         """``fit(btf, *, seed=0, progress=None, **params) -> Representation``."""
         return self.fitting.fit
 
+    def quick_fit(self, btf: Any, **parameters: Any) -> Any:
+        """``fit`` with the preset "quick" where the method has one: for checks that make many fits."""
+        return self.fit(btf, **self.presets.get("quick", {}) | parameters)
+
     @property
     def presets(self) -> dict[str, Facts]:
-        """Named settings of ``fit``; "paper" has the settings of the method's paper."""
+        """Named settings of ``fit``; "paper": those of the method's paper; "quick": what checks take for their fits."""
         return self.fitting.PRESETS
 
     @property
@@ -226,6 +230,13 @@ _ROWS = (
         "gbrdf.definition",
         fit="gbrdf.decomposition.pipeline",
         editing="gbrdf.maps",
+    ),
+    _row(
+        "neural",
+        "Latent texture and a small network",
+        "Rainer, Jakob, Ghosh, Weyrich 2019, Kuznetsov et al. 2021",
+        "neural.definition",
+        fit="neural.fit",
     ),
 )
 

@@ -65,7 +65,7 @@ def _at_samples(
 
 def deterministic(method: Method, btf: SampledBTF, name: str) -> Iterator[Finding]:
     """Two fits with one seed hold the same bytes."""
-    one, two = (method.fit(btf, seed=1).arrays() for _ in range(2))
+    one, two = (method.quick_fit(btf, seed=1).arrays() for _ in range(2))
     different = [k for k in one if one[k].tobytes() != two[k].tobytes()]
     yield limit_finding(
         "same seed, same bytes", method.key, name, len(different), "stress.deterministic.maps",
@@ -83,7 +83,7 @@ def monotone(method: Method, btf: SampledBTF, name: str) -> Iterator[Finding]:
         errors = []
         for n in steps:
             value = (n,) * len(default) if isinstance(default, tuple) else n
-            errors.append(sample_error(method.fit(btf, **{size: value}), btf))
+            errors.append(sample_error(method.quick_fit(btf, **{size: value}), btf))
         rise = max(b / max(a, 1e-12) for a, b in itertools.pairwise(errors))
         yield limit_finding(
             f"error by {size}", method.key, name, rise, "stress.monotone.rise",
@@ -93,7 +93,7 @@ def monotone(method: Method, btf: SampledBTF, name: str) -> Iterator[Finding]:
 
 def symmetric(method: Method, btf: SampledBTF, name: str) -> Iterator[Finding]:
     """Scaled channels, shifted texels, and the whole material turned by half a turn."""
-    plain = method.fit(btf)
+    plain = method.quick_fit(btf)
     own, _ = _at_samples(plain, btf)
     scale = max(np.sqrt((own**2).mean()), 1e-300)
     error = sample_error(plain, btf)
@@ -118,15 +118,15 @@ def symmetric(method: Method, btf: SampledBTF, name: str) -> Iterator[Finding]:
 
     # A power of two changes no rounding of the data.
     scaled = _with(btf, btf.values.astype(np.float32) * np.float32(0.25))
-    other = method.fit(scaled)
+    other = method.quick_fit(scaled)
     yield finding(
         "channels × ¼", 4 * _at_samples(other, btf)[0], scaled, "stress.scaling.ratio", other, [error]
     )
     # Where texels or directions change places, what starts at random starts elsewhere: other seeds show what that does.
-    errors = [error, *(sample_error(method.fit(btf, seed=seed), btf) for seed in SEEDS)]
+    errors = [error, *(sample_error(method.quick_fit(btf, seed=seed), btf) for seed in SEEDS)]
     shift = (btf.texels[0] // 4, btf.texels[1] // 4)
     rolled = _with(btf, np.roll(btf.values, shift, (2, 3)))
-    other = method.fit(rolled)
+    other = method.quick_fit(rolled)
     offset = np.array([shift[1] / btf.texels[1], shift[0] / btf.texels[0]])
     moved = _Moved(other, lambda uv, *w: (uv + offset, *w))
     yield finding(
@@ -134,7 +134,7 @@ def symmetric(method: Method, btf: SampledBTF, name: str) -> Iterator[Finding]:
     )
     turned = half_turn(btf)
     if turned is not None:
-        other = method.fit(turned)
+        other = method.quick_fit(turned)
         value = _at_samples(other, btf, turned=True)[0]
         yield finding("half a turn", value, turned, "stress.turn.ratio", other, errors)
 
@@ -221,7 +221,7 @@ def overflow(method: Method) -> Iterator[Finding]:
         parameters = inspect.signature(method.fit).parameters
         further = {"storage": "half"} if "storage" in parameters else {}
         try:
-            made = method.fit(btf, **further)
+            made = method.quick_fit(btf, **further)
         except InputError as refusal:
             yield limit_finding(
                 "overflow", method.key, name, 0, "stress.overflow.silent", where=f"refused: {refusal}"
@@ -245,7 +245,7 @@ def refuses_nan(method: Method, folder: Path) -> Iterator[Finding]:
     silent = 0
     attempts = (
         lambda: _with(btf, values),
-        lambda: method.fit(spoiled),
+        lambda: method.quick_fit(spoiled),
         lambda: spoiled.save(folder / "nan.btf.zarr"),
     )
     for attempt in attempts:

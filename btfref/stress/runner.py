@@ -132,7 +132,7 @@ def stress_data(
         further = {} if kind is None else {"storage": kind}
         label = name if kind is None else f"{name}, {kind}"
         try:
-            made = row.fit(btf, **further)
+            made = row.quick_fit(btf, **further)
         except InputError as refusal:
             if kind is None or refusal.field != "storage":
                 yield limit_finding("refusal", key, label, 0, "stress.refusal.silent", where=str(refusal))
@@ -301,9 +301,9 @@ def stress_fits(key: str) -> Iterator[Finding]:
         yield from properties.deterministic(row, btf, name)
         yield from properties.monotone(row, btf, name)
         yield from properties.symmetric(row, btf, name)
-        yield from properties.energy(row, row.fit(btf), btf, name)
+        yield from properties.energy(row, row.quick_fit(btf), btf, name)
     relief = make("relief")
-    yield from properties.energy(row, row.fit(relief), relief, "relief", "stress.energy.relief")
+    yield from properties.energy(row, row.quick_fit(relief), relief, "relief", "stress.energy.relief")
     yield from properties.overflow(row)
     with tempfile.TemporaryDirectory() as folder:
         yield from properties.refuses_nan(row, Path(folder))
@@ -354,7 +354,7 @@ def show_case(
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"stress.{key}.exr"
         further = {} if storage is None else {"storage": storage}
-        save(method(key).fit(make(name, seed), **further), path)
+        save(method(key).quick_fit(make(name, seed), **further), path)
         representation = load(path)
         lookups = block(representation, seed, number, n)
         reference, value = (

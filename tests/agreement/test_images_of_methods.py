@@ -42,6 +42,7 @@ SETTINGS = {
     "cmf": {"clusters": 32, "half_step": 10.0},
     "hf": {"clusters": 32, "smoothness": 1.0},
     "gbrdf": {"pairs": 32, "layers": 16, "materials": 2},
+    "neural": {"hidden": 16, "passes": 2.0},
 }
 
 

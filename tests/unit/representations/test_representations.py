@@ -118,7 +118,7 @@ def test_payload_counts_the_maps_alone():
 
 
 def test_fits_are_deterministic(small, row):
-    a, b = row.fit(small), row.fit(small)
+    a, b = row.quick_fit(small), row.quick_fit(small)
     for name, array in a.arrays().items():
         np.testing.assert_array_equal(array, b.arrays()[name])
 
@@ -134,7 +134,7 @@ def test_degenerate_data(values, shape, row):
     """Fewer texels than clusters or components, no variance, no energy: finite, and the constant comes back."""
     btf = oracle_btf(shape)
     btf = dataclasses.replace(btf, values=np.full_like(btf.values, values))
-    representation = row.fit(btf)
+    representation = row.quick_fit(btf)
     for array in representation.arrays().values():
         assert np.isfinite(array).all()
     value = at_samples(btf, representation)

@@ -1,0 +1,1 @@
+"""A latent texture and a small network (`neural`)."""
