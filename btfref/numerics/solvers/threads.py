@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
+from typing import TypeVar
 
 import numpy as np
+
+T = TypeVar("T")
 
 #: Threads that :func:`product` may use: those of BLAS before :func:`reproducible` took them.
 _WORKERS: ContextVar[int] = ContextVar("_WORKERS", default=1)
@@ -48,12 +51,33 @@ def reproducible() -> Iterator[None]:
         _WORKERS.reset(token)
 
 
-def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def in_parallel(action: Callable[[T], object], items: Iterable[T]) -> None:
+    """Do something for each of some items, on several threads within :func:`reproducible`.
+
+    Parameters
+    ----------
+    action : callable
+        Independent of the other items, so that the number of threads makes no difference.
+    items : iterable
+    """
+    items = list(items)
+    workers = min(_WORKERS.get(), len(items))
+    if workers <= 1:
+        for item in items:
+            action(item)
+    else:
+        with ThreadPoolExecutor(workers) as pool:
+            list(pool.map(action, items))
+
+
+def product(a: np.ndarray, b: np.ndarray, *, rows: int = BLOCK) -> np.ndarray:
     """``a @ b`` in blocks of rows of ``a``, or of columns of ``b`` where there are more, on several threads.
 
     Parameters
     ----------
     a, b : ndarray, shapes (n, k), (k, m)
+    rows : int
+        Rows, or columns, of a block.
 
     Returns
     -------
@@ -65,19 +89,12 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     tall = n >= m
 
     def block(start: int) -> None:
-        part = slice(start, start + BLOCK)
+        part = slice(start, start + rows)
         if tall:
             np.matmul(a[part], b, out=result[part])
         else:
             # Contiguous, so that no part is copied and no path through BLAS depends on strides.
             result[:, part] = a @ np.ascontiguousarray(b[:, part])
 
-    starts = range(0, n if tall else m, BLOCK)
-    workers = min(_WORKERS.get(), len(starts))
-    if workers <= 1:
-        for start in starts:
-            block(start)
-    else:
-        with ThreadPoolExecutor(workers) as pool:
-            list(pool.map(block, starts))
+    in_parallel(block, range(0, n if tall else m, rows))
     return result

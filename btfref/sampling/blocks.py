@@ -1,0 +1,128 @@
+"""A sampled BTF read part by part: what fits take, whether it stands on disk or in memory."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
+import numpy as np
+
+from btfref.conventions import in_one_line
+from btfref.errors import InputError
+from btfref.sampling.store.store import BTFStore, open_store
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from btfref.numerics.sphere.directions import DirectionSet
+    from btfref.types import Facts, PathLike
+
+
+@runtime_checkable
+class BTFBlocks(Protocol):
+    """A sampled BTF of which a view, or some rows of texels, are read at a time.
+
+    :class:`btfref.sampling.sampled_btf.SampledBTF` satisfies it, and so does :class:`StreamedBTF`: a fit that reads
+    nothing else gives the same bytes for both.
+    """
+
+    @property
+    def views(self) -> DirectionSet:
+        """Directions to the viewer."""
+
+    @property
+    def lights(self) -> DirectionSet:
+        """Directions to the light."""
+
+    @property
+    def texels(self) -> tuple[int, int]:
+        """Rows and columns."""
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Type of the values: float16 or float32."""
+
+    @property
+    def attributes(self) -> Facts:
+        """Conventions, seed, parameters, parent, versions."""
+
+    @property
+    def path(self) -> Path | None:
+        """Where it was read from."""
+
+    @property
+    def spare(self) -> int | None:
+        """Bytes in which a fit may keep what it would make anew in each pass otherwise; None for any number.
+
+        It has no influence on any result.
+        """
+
+    def view(self, view: int) -> np.ndarray:
+        """Values of a view, shape (lights, rows, columns, 3); not to be changed."""
+
+    def rows(self, first: int, last: int) -> np.ndarray:
+        """Values of the rows ``first … last − 1``, shape (views, lights, last − first, columns, 3); not to be changed."""
+
+
+class StreamedBTF:
+    """A store whose values stay on disk.
+
+    Parameters
+    ----------
+    store : BTFStore or path-like
+    spare : int
+        See :class:`BTFBlocks`.
+
+    Raises
+    ------
+    InputError
+        An incomplete store.
+    """
+
+    def __init__(self, store: BTFStore | PathLike, *, spare: int = 0) -> None:
+        store = store if isinstance(store, BTFStore) else open_store(store)
+        refuse_incomplete(store)
+        self._store, self.spare = store, spare
+        self._held: tuple[int, np.ndarray] | None = None
+        self.views, self.lights, self.texels = store.views, store.lights, store.texels
+        self.dtype, self.attributes, self.path = store.dtype, store.attributes, store.path
+        #: Views and rows that were read, in whole BTFs: what passes a fit makes.
+        self.passes = 0.0
+
+    def __repr__(self) -> str:
+        size = int(np.prod(self._shape, dtype=np.int64)) * self.dtype.itemsize
+        kind = f"StreamedBTF {self.dtype}"
+        return in_one_line(kind, self.texels, self.views.facts, self.lights.facts, size)
+
+    @property
+    def _shape(self) -> tuple[int, ...]:
+        return len(self.views), len(self.lights), *self.texels, 3
+
+    def view(self, view: int) -> np.ndarray:
+        """See :class:`BTFBlocks`."""
+        if self._held is None or self._held[0] != view:
+            self._held = None
+            self._held = view, self._store.read(views=view, variance=False)[0][0]
+            self.passes += 1 / len(self.views)
+        return self._held[1]
+
+    def rows(self, first: int, last: int) -> np.ndarray:
+        """See :class:`BTFBlocks`."""
+        self._held = None
+        self.passes += (last - first) / self.texels[0]
+        return self._store.read(rows=slice(first, last), variance=False)[0]
+
+
+def refuse_incomplete(store: BTFStore) -> None:
+    """InputError for a store of which a part is missing."""
+    if store.complete:
+        return
+    missing = store.attributes.get("parent", {}).get("images_missing")
+    raise InputError(
+        f"incomplete: {missing} images are missing in what it was made from"
+        if missing
+        else "incomplete: its run was interrupted; start the same command again to finish it",
+        file=store.path,
+        field="coverage",
+        got=f"{store.coverage.mean():.1%}",
+        expected="100%",
+    )
