@@ -49,9 +49,8 @@ class BTFBlocks(Protocol):
     def path(self) -> Path | None:
         """Where it was read from."""
 
-    @property
-    def spare(self) -> int | None:
-        """Bytes in which a fit may keep what it would make anew in each pass otherwise; None for any number.
+    def claim(self, size: int) -> bool:
+        """Whether a fit may keep so many bytes of what it would make anew in each pass otherwise.
 
         It has no influence on any result.
         """
@@ -70,7 +69,8 @@ class StreamedBTF:
     ----------
     store : BTFStore or path-like
     spare : int
-        See :class:`BTFBlocks`.
+        Bytes in which views, and what fits make of them, may be kept for the next pass. It has no influence on any
+        result.
 
     Raises
     ------
@@ -81,8 +81,9 @@ class StreamedBTF:
     def __init__(self, store: BTFStore | PathLike, *, spare: int = 0) -> None:
         store = store if isinstance(store, BTFStore) else open_store(store)
         refuse_incomplete(store)
-        self._store, self.spare = store, spare
-        self._held: tuple[int, np.ndarray] | None = None
+        self._store, self._spare = store, spare
+        self._kept: dict[int, np.ndarray] = {}
+        self._last: tuple[int, np.ndarray] | None = None
         self.views, self.lights, self.texels = store.views, store.lights, store.texels
         self.dtype, self.attributes, self.path = store.dtype, store.attributes, store.path
         #: Views and rows that were read, in whole BTFs: what passes a fit makes.
@@ -97,17 +98,30 @@ class StreamedBTF:
     def _shape(self) -> tuple[int, ...]:
         return len(self.views), len(self.lights), *self.texels, 3
 
+    def claim(self, size: int) -> bool:
+        """See :class:`BTFBlocks`."""
+        if size > self._spare:
+            return False
+        self._spare -= size
+        return True
+
     def view(self, view: int) -> np.ndarray:
         """See :class:`BTFBlocks`."""
-        if self._held is None or self._held[0] != view:
-            self._held = None
-            self._held = view, self._store.read(views=view, variance=False)[0][0]
+        if view in self._kept:
+            return self._kept[view]
+        if self._last is None or self._last[0] != view:
+            self._last = None
+            values = self._store.read(views=view, variance=False)[0][0]
             self.passes += 1 / len(self.views)
-        return self._held[1]
+            if self.claim(values.nbytes):
+                self._kept[view] = values
+                return values
+            self._last = view, values
+        return self._last[1]
 
     def rows(self, first: int, last: int) -> np.ndarray:
         """See :class:`BTFBlocks`."""
-        self._held = None
+        self._last = None
         self.passes += (last - first) / self.texels[0]
         return self._store.read(rows=slice(first, last), variance=False)[0]
 

@@ -120,10 +120,9 @@ class SampledBTF:
         """Type of the values."""
         return self.values.dtype
 
-    @property
-    def spare(self) -> int | None:
-        """No bound: who holds all values may hold as much again; see :class:`btfref.sampling.blocks.BTFBlocks`."""
-        return None
+    def claim(self, size: int) -> bool:
+        """Always: who holds all values may hold more; see :class:`btfref.sampling.blocks.BTFBlocks`."""
+        return True
 
     def view(self, view: int) -> np.ndarray:
         """Values of a view, shape (lights, rows, columns, 3), without a copy."""
