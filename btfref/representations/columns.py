@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 #: same, since sums go by blocks.
 BLOCK_BYTES = 96 << 20
 
+#: Images of a block that a thread works on at a time.
+TOGETHER = 16
+
 
 class Steps:
     """Counts the steps of a fit for ``progress(done, total, label)``, which may be None.
@@ -63,18 +66,31 @@ def planes(values: np.ndarray, order: np.ndarray | None = None) -> np.ndarray:
     order : ndarray of int, optional
         Of the texels.
     """
-    result = np.zeros((len(values), 3, values.shape[1]), np.float32)
+    return each_part(
+        lambda part: (part if order is None else part[:, order]).astype(np.float32).swapaxes(1, 2),
+        values,
+        (3, values.shape[1]),
+    )
 
-    def one(light: int) -> None:
-        image = values[light].astype(np.float32)
-        result[light] = (image if order is None else image[order]).T
 
-    in_parallel(one, range(len(values)))
+def each_part(
+    action: Callable[[np.ndarray], np.ndarray], images: np.ndarray, shape: tuple[int, ...]
+) -> np.ndarray:
+    """An action on images, a few of them at a time, on several threads; each result has the given shape, in float32."""
+    result = np.zeros((len(images), *shape), np.float32)
+
+    def some(first: int) -> None:
+        part = slice(first, first + TOGETHER)
+        result[part] = action(images[part])
+
+    in_parallel(some, range(0, len(images), TOGETHER))
     return result
 
 
 class TexelColumns:
-    """:class:`btfref.numerics.solvers.streaming.Columns` of a sampled BTF: a texel a row, (view, light, channel) columns.
+    """A sampled BTF as :class:`btfref.numerics.solvers.streaming.Columns`: a texel a row.
+
+    Columns are (view, light, channel).
 
     Parameters
     ----------
@@ -85,9 +101,7 @@ class TexelColumns:
         Order of the texels.
     """
 
-    def __init__(
-        self, btf: BTFBlocks, tick: Callable[[], object], order: np.ndarray | None = None
-    ) -> None:
+    def __init__(self, btf: BTFBlocks, tick: Callable[[], object], order: np.ndarray | None = None) -> None:
         self._btf, self._tick, self._order = btf, tick, order
         self._checked = False
 

@@ -59,7 +59,7 @@ class BTFBlocks(Protocol):
         """Values of a view, shape (lights, rows, columns, 3); not to be changed."""
 
     def rows(self, first: int, last: int) -> np.ndarray:
-        """Values of the rows ``first … last − 1``, shape (views, lights, last − first, columns, 3); not to be changed."""
+        """Values of the rows ``first … last − 1``: (views, lights, rows, columns, 3); not to be changed."""
 
 
 class StreamedBTF:
@@ -84,6 +84,7 @@ class StreamedBTF:
         self._store, self._spare = store, spare
         self._kept: dict[int, np.ndarray] = {}
         self._last: tuple[int, np.ndarray] | None = None
+        self._band: tuple[int, np.ndarray] | None = None
         self.views, self.lights, self.texels = store.views, store.lights, store.texels
         self.dtype, self.attributes, self.path = store.dtype, store.attributes, store.path
         #: Views and rows that were read, in whole BTFs: what passes a fit makes.
@@ -122,8 +123,49 @@ class StreamedBTF:
     def rows(self, first: int, last: int) -> np.ndarray:
         """See :class:`BTFBlocks`."""
         self._last = None
+        start = first - first % self.band
+        if last > start + self.band:
+            self._band = None
+            return self._rows(first, last)
+        if self._band is None or self._band[0] != start:
+            self._band = None
+            self._band = start, self._rows(start, min(start + self.band, self.texels[0]))
+        return self._band[1][:, :, first - start : last - start]
+
+    @property
+    def band(self) -> int:
+        """Rows that are read together: a chunk's where there is room for them, else a part of them."""
+        row = self.dtype.itemsize * 3 * len(self.views) * len(self.lights) * self.texels[1]
+        tile = min(self._store.tile[0], self.texels[0])
+        parts = -(-tile // max(1, min(tile, self._spare // row)))
+        return -(-tile // parts)
+
+    def _rows(self, first: int, last: int) -> np.ndarray:
         self.passes += (last - first) / self.texels[0]
         return self._store.read(rows=slice(first, last), variance=False)[0]
+
+
+def texel_values(btf: BTFBlocks, texels: np.ndarray) -> np.ndarray:
+    """Values of some texels.
+
+    Parameters
+    ----------
+    btf : BTFBlocks
+    texels : ndarray of int, shape (k,)
+        Flat indices. Read by rows where they follow each other, else in one pass over the views.
+
+    Returns
+    -------
+    ndarray, shape (views, lights, k, 3)
+    """
+    columns = btf.texels[1]
+    if (np.diff(texels) == 1).all():
+        first, last = int(texels[0]) // columns, int(texels[-1]) // columns + 1
+        rows = btf.rows(first, last)
+        start = int(texels[0]) - first * columns
+        return rows.reshape(*rows.shape[:2], -1, 3)[:, :, start : start + len(texels)]
+    shape = len(btf.lights), -1, 3
+    return np.stack([btf.view(view).reshape(shape)[:, texels] for view in range(len(btf.views))])
 
 
 def refuse_incomplete(store: BTFStore) -> None:

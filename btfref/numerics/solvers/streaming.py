@@ -99,7 +99,9 @@ class GramPass:
         with one_blas_thread():
             q, r = np.linalg.qr(self.image.astype(float))
             u, singular, vt = np.linalg.svd(r)
-        kept = singular > NOISE * max(singular[0], np.finfo(np.float32).tiny) if len(singular) else singular > 0
+        kept = (
+            singular > NOISE * max(singular[0], np.finfo(np.float32).tiny) if len(singular) else singular > 0
+        )
         inverse = np.where(kept, 1 / np.where(kept, singular, 1), 0)[:rank]
         coordinates = product(self.sums, vt.T[:, :rank] * inverse)
         return product(u.T[:rank].copy(), q.T).astype(np.float32), coordinates.astype(np.float32)

@@ -12,8 +12,11 @@ import numpy as np
 
 T = TypeVar("T")
 
-#: Threads that :func:`product` may use: those of BLAS before :func:`reproducible` took them.
+#: Threads that :func:`in_parallel` may use: those of BLAS before :func:`reproducible` took them.
 _WORKERS: ContextVar[int] = ContextVar("_WORKERS", default=1)
+
+#: And these threads themselves: a pass over many small blocks would spend its time on starting them.
+_POOL: ContextVar[ThreadPoolExecutor | None] = ContextVar("_POOL", default=None)
 
 #: Rows, or columns, of a block of :func:`product`: enough for a BLAS call to be worth it; the same on all machines.
 BLOCK = 512
@@ -44,11 +47,17 @@ def reproducible() -> Iterator[None]:
 
     threads = [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
     token = _WORKERS.set(max(_WORKERS.get(), *threads, 1))
+    outer = _POOL.get()
+    pool = outer or ThreadPoolExecutor(_WORKERS.get())
+    of_pool = _POOL.set(pool)
     try:
         with threadpool_limits(limits=1):
             yield
     finally:
         _WORKERS.reset(token)
+        _POOL.reset(of_pool)
+        if outer is None:
+            pool.shutdown()
 
 
 def in_parallel(action: Callable[[T], object], items: Iterable[T]) -> None:
@@ -60,14 +69,12 @@ def in_parallel(action: Callable[[T], object], items: Iterable[T]) -> None:
         Independent of the other items, so that the number of threads makes no difference.
     items : iterable
     """
-    items = list(items)
-    workers = min(_WORKERS.get(), len(items))
-    if workers <= 1:
+    items, pool = list(items), _POOL.get()
+    if pool is None or min(_WORKERS.get(), len(items)) <= 1:
         for item in items:
             action(item)
     else:
-        with ThreadPoolExecutor(workers) as pool:
-            list(pool.map(action, items))
+        list(pool.map(action, items))
 
 
 def product(a: np.ndarray, b: np.ndarray, *, rows: int = BLOCK) -> np.ndarray:

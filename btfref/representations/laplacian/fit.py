@@ -128,7 +128,9 @@ def fit(
     energy, table = _first_pass(images)
     maps, average, facts = _mean_maps(btf, table, mean, storage)
     rng = np.random.default_rng(seed)
-    state = _Levels(images, energy, average, prediction == "closed", filter_type, storage, len(btf.views), rng)
+    state = _Levels(
+        images, energy, average, prediction == "closed", filter_type, storage, len(btf.views), rng
+    )
     described: list[Facts] = []
     for k in range(len(shapes) - 1, -1, -1):
         steps.begin(f"level {k}")
@@ -317,12 +319,12 @@ class _Levels:
         self.level_errors[k] = np.sqrt(error / energy) if energy > 0 else 0.0
         return [int(n) for n in own]
 
-    def _ranges(
-        self, k: int, ranks: list[int]
-    ) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
+    def _ranges(self, k: int, ranks: list[int]) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
         """Leading directions of the differences of level k, [channel], and the differences' squares by channel."""
         n, d = self.images.texels(k), self.images.n_pairs
-        bases = [self.rng.standard_normal((n, min(r + OVERSAMPLING, n, d) if r else 0), np.float32) for r in ranks]
+        bases = [
+            self.rng.standard_normal((n, min(r + OVERSAMPLING, n, d) if r else 0), np.float32) for r in ranks
+        ]
         model, squares = self._model(k), np.zeros(3)
         for turn in range(PASSES):
             steps = [GramPass(basis, d) for basis in bases]

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from btfref.numerics.pyramid import expansion, level_shapes, reduction
-from btfref.numerics.solvers.threads import in_parallel
 from btfref.numerics.ycbcr import FROM_RGB
-from btfref.representations.columns import light_blocks, planes
+from btfref.representations.columns import each_part, light_blocks, planes
 from btfref.representations.lookup import refuse_not_finite
 
 if TYPE_CHECKING:
@@ -96,7 +95,7 @@ class PyramidImages:
                 image = planes(values[lights])
                 if check:
                     refuse_not_finite(image, self._btf)
-                image = _each(lambda block: weights @ block, image, self.texels(0))
+                image = each_part(lambda block: weights @ block, image, image.shape[1:])
                 part = slice(view * n_lights + lights.start, view * n_lights + lights.stop)
                 images = [image]
                 for k in range(1, len(self.shapes)):
@@ -109,26 +108,20 @@ class PyramidImages:
         rows, columns = self._operators[level]
         shape = self.shapes[level]
 
-        def reduced(image: np.ndarray) -> np.ndarray:
-            return (rows @ image.reshape(3, *shape) @ columns.T).reshape(3, -1)
+        def reduced(part: np.ndarray) -> np.ndarray:
+            images = rows @ part.reshape(len(part), 3, *shape) @ columns.T
+            return images.reshape(len(part), 3, -1)
 
-        return _each(reduced, images, self.texels(level + 1))
-
-
-def _each(action: Callable[[np.ndarray], np.ndarray], images: np.ndarray, texels: int) -> np.ndarray:
-    """An action on each pair's image (3, texels), on several threads."""
-    result = np.zeros((len(images), 3, texels), np.float32)
-
-    def one(index: int) -> None:
-        result[index] = action(images[index])
-
-    in_parallel(one, range(len(images)))
-    return result
+        return each_part(reduced, images, (3, self.texels(level + 1)))
 
 
-def expanded(images: np.ndarray, coarse: tuple[int, int], fine: tuple[int, int], filter_type: str) -> np.ndarray:
+def expanded(
+    images: np.ndarray, coarse: tuple[int, int], fine: tuple[int, int], filter_type: str
+) -> np.ndarray:
     """Images (…, texels) looked up at the texel centres of a finer level."""
     if coarse == fine:
         return images
-    rows, columns = (expansion(n, m, filter_type).astype(images.dtype) for n, m in zip(fine, coarse, strict=True))
+    rows, columns = (
+        expansion(n, m, filter_type).astype(images.dtype) for n, m in zip(fine, coarse, strict=True)
+    )
     return (rows @ images.reshape(-1, *coarse) @ columns.T).reshape(*images.shape[:-1], -1)

@@ -8,6 +8,7 @@ VMV 2003; the same authors, "Fast Environmental Lighting for Local-PCA Encoded B
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -44,9 +45,6 @@ if TYPE_CHECKING:
     from btfref.types import Facts, Progress
 
 
-#: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(7.6, tables=("clusters", "components"))
-
 #: "paper": the setting of the 2004 paper's timings, 16 clusters with a mean and 4 components, in floats.
 PRESETS = {"paper": {"clusters": 16, "components": 4, "storage": "float"}}
 
@@ -59,6 +57,9 @@ OVERSAMPLING = 4
 
 #: How often the values are read for that subspace; the clusters' bases take two passes more.
 PASSES = 2
+
+#: See :mod:`btfref.representations.fit_memory`.
+FIT_MEMORY = FitMemory(view=14, columns=SUBSPACE_RANK + 8, tables=("clusters", "components"))
 
 
 class Representation(StoredMaps):
@@ -277,25 +278,25 @@ class ClusterBases:
         means = np.zeros((self.clusters, d), np.float32)
         samples = {k: np.zeros((d, start.shape[1]), np.float32) for k, start in self.starts.items()}
 
-        def sample(k: int) -> None:
+        def sample(columns: slice, block: np.ndarray, k: int) -> None:
             members = block[:, self.parts[k]]
             means[k, columns] = members.mean(1)
             members -= means[k, columns, None]
             samples[k][columns] = members @ self.starts[k]
 
         for columns, block in matrix.blocks():
-            in_parallel(sample, self.used)
+            in_parallel(partial(sample, columns, block), self.used)
         spans = {k: orthonormal(found) for k, found in samples.items()}
         projected = {k: np.zeros((self.parts[k].stop - self.parts[k].start, span.shape[1]))
                      for k, span in spans.items()}  # fmt: skip
 
-        def project(k: int) -> None:
+        def project(columns: slice, block: np.ndarray, k: int) -> None:
             members = block[:, self.parts[k]]
             members -= means[k, columns, None]
             projected[k] += members.T @ spans[k][columns]
 
         for columns, block in matrix.blocks():
-            in_parallel(project, self.used)
+            in_parallel(partial(project, columns, block), self.used)
         axes = np.zeros((self.clusters, self.components, d), np.float32)
         weights = np.zeros((n, self.components), np.float32)
         error = 0.0
