@@ -59,7 +59,7 @@ OVERSAMPLING = 4
 PASSES = 2
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(view=14, columns=SUBSPACE_RANK + 8, tables=("clusters", "components"))
+FIT_MEMORY = FitMemory(view=14, columns=SUBSPACE_RANK + 24, tables=("clusters", "components"))
 
 
 class Representation(StoredMaps):

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(view=12, columns=8, tables=("components",))
+FIT_MEMORY = FitMemory(view=12, columns=24, tables=("components",))
 
 #: Koudelka et al. keep 150 components for one texture; 16 cost a lookup about three times what local PCA's 4 cost.
 PRESETS = {"paper": {"components": 150, "storage": "float"}}
