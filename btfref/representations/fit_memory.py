@@ -52,6 +52,7 @@ def least_budget(method: Method, store: BTFStore, parameters: Facts | None = Non
         blocks *= max(1.0, _number(given[name]) / _number(method.parameters[name]))
     tables = math.prod(_number(given[name]) for name in states.tables) if states.tables else 0
     blocks += TABLE_COPIES * 4 * (tables + states.columns) * (3 * pairs + texels)
+    blocks += texels * (states.texel + len(store.views) * states.field)
     wider = np.dtype(store.dtype).itemsize - HALF
     if states.streams:
         together = max(1, min(store.texels[0], states.texels // store.texels[1])) * store.texels[1]

@@ -301,6 +301,8 @@ class FitMemory:
         As many texels as such rows have at most, where one row has not more.
     columns : int
         Further tables, whatever the parameters are.
+    texel, field : float
+        Bytes per texel, and per texel and view.
     """
 
     each: float = 0.0
@@ -311,6 +313,8 @@ class FitMemory:
     rows: float = 0.0
     texels: int = 0
     columns: int = 0
+    texel: float = 0.0
+    field: float = 0.0
 
     @property
     def streams(self) -> bool:

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(0.02, 220 << 20, scales=("lobes",), rows=4, texels=light_functions.BLOCK)
+FIT_MEMORY = FitMemory(blocks=220 << 20, scales=("lobes",), rows=4, texels=light_functions.BLOCK, texel=400)
 
 #: "paper": Table 1's four lobes, in floats.
 PRESETS = {"paper": {"lobes": 4, "storage": "float"}}

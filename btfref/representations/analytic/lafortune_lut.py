@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(0.05, 220 << 20, scales=("lobes",), rows=4, texels=light_functions.BLOCK)
+FIT_MEMORY = FitMemory(
+    blocks=220 << 20, scales=("lobes",), rows=4, texels=light_functions.BLOCK, texel=400, field=12
+)
 
 #: "paper": Table 1's four lobes, in floats.
 PRESETS: dict[str, Facts] = {"paper": {"lobes": 4, "bounded": False, "storage": "float"}}

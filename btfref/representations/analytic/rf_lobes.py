@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(0.3, 560 << 20, scales=("lobes",), rows=4, texels=light_functions.BLOCK)
+FIT_MEMORY = FitMemory(blocks=560 << 20, scales=("lobes",), rows=4, texels=light_functions.BLOCK, field=75)
 
 #: "paper": two lobes in floats.
 PRESETS = {"paper": {"lobes": 2, "storage": "float"}}

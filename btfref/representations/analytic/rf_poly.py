@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(0.25, rows=6, texels=light_functions.BLOCK)
+FIT_MEMORY = FitMemory(rows=6, texels=light_functions.BLOCK, field=61)
 
 #: "paper": all 81 views in floats.
 PRESETS = {"paper": {"storage": "float"}}

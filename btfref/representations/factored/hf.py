@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 __all__ = ["FIT_MEMORY", "PRESETS", "Representation", "fit"]
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(4.2, rows=12, texels=1)
+FIT_MEMORY = FitMemory(rows=12, texels=1, texel=83e3)
 
 #: "paper": factors as the system leaves them, all in 8 bits, scales from the normalisation alone.
 PRESETS = {
