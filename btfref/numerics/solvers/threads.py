@@ -69,12 +69,12 @@ def in_parallel(action: Callable[[T], object], items: Iterable[T]) -> None:
         Independent of the other items, so that the number of threads makes no difference.
     items : iterable
     """
-    items, pool = list(items), _POOL.get()
-    if pool is None or min(_WORKERS.get(), len(items)) <= 1:
-        for item in items:
+    todo, pool = list(items), _POOL.get()
+    if pool is None or min(_WORKERS.get(), len(todo)) <= 1:
+        for item in todo:
             action(item)
     else:
-        list(pool.map(action, items))
+        list(pool.map(action, todo))
 
 
 def product(a: np.ndarray, b: np.ndarray, *, rows: int = BLOCK) -> np.ndarray:

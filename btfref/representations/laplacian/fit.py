@@ -275,7 +275,8 @@ class _Levels:
 
     def _model(self, k: int) -> Model:
         """What the levels that are stored say of level k."""
-        shapes, tables = self.images.shapes, []
+        shapes = self.images.shapes
+        tables: list[tuple[np.ndarray, np.ndarray]] = []
         for channel, kept in enumerate(self.kept):
             weights = [np.ones((1, self.images.texels(k)), np.float32)]
             weights += [expanded(w, shapes[j], shapes[k], self.filter_type) for j, w, _ in kept]
@@ -285,7 +286,8 @@ class _Levels:
 
     def _exact(self, k: int, part: slice, images: Images) -> list[np.ndarray]:
         """Differences of level k to the exact coarser ones, [channel] (pairs, texels)."""
-        shapes, rests = self.images.shapes, []
+        shapes = self.images.shapes
+        rests: list[tuple[int, np.ndarray]] = []
         for j in range(len(shapes) - 1, k - 1, -1):
             rest = images[j - k] - self.average[part, :, None]
             for i, coarser in rests:
@@ -334,7 +336,7 @@ class _Levels:
                     if step.basis.shape[1]:
                         step.add(part, rest)
                 if turn == 0:
-                    squares += [np.einsum("ij,ij->i", r, r).sum(dtype=float) for r in rests]
+                    squares += np.array([np.einsum("ij,ij->i", r, r).sum(dtype=float) for r in rests])
             if turn < PASSES - 1:
                 bases = [step.next_basis() if step.basis.shape[1] else step.basis for step in steps]
         none = np.zeros((0, d), np.float32), np.zeros((n, 0), np.float32)

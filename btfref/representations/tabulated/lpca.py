@@ -253,7 +253,7 @@ class ClusterBases:
         ends = np.cumsum(np.bincount(labels, minlength=clusters)).tolist()
         self.parts = [slice(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
         self.used = [k for k, part in enumerate(self.parts) if part.stop > part.start]
-        self.starts = {}
+        self.starts: dict[int, np.ndarray] = {}
         for k in self.used:
             own = coordinates[self.order[self.parts[k]]]
             start = leading_axes(own, components + OVERSAMPLING)
