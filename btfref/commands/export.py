@@ -28,6 +28,7 @@ _SETTINGS = (
     "error",
     "colour_model",
     "scalar",
+    "texels",
 )
 
 #: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
@@ -65,6 +66,12 @@ def add_arguments(parser: ArgumentParser) -> None:
     bonn.add_argument("--error", type=number_above(0), metavar="E", help="relative RMS error that decides K")
     bonn.add_argument("--colour-model", type=int, choices=(0, 11), help="0: RGB (default), 11: as UBO2014")
     bonn.add_argument("--scalar", type=int, choices=(2, 4), help="bytes of a factor (default 2)")
+    bonn.add_argument(
+        "--texels",
+        type=count(1),
+        metavar="N",
+        help="rows and columns of the file: the tile is repeated (default: the BTF's own)",
+    )
     add_memory(parser)
     add_json(parser, "what was written")
 

@@ -70,9 +70,9 @@ def run(args: Namespace) -> int:
     parameters = row.settings(args.preset, given)
 
     from btfref.representations import between
-    from btfref.representations.fit_memory import check_budget
+    from btfref.representations.fit_memory import read_within
     from btfref.representations.protocol import FitsPartially
-    from btfref.sampling import SampledBTF, memory, open_store
+    from btfref.sampling import memory, open_store
 
     if args.partial:
         fitting = row.fitting
@@ -80,8 +80,7 @@ def run(args: Namespace) -> int:
             raise InputError("the method needs the whole BTF", field="--partial", got=row.key)
         representation = fitting.fit_partial(open_store(args.btf), **parameters)
     else:
-        check_budget(row, open_store(args.btf), args.memory, parameters)
-        btf = SampledBTF.load(args.btf, variance=False)
+        btf = read_within(row, open_store(args.btf), args.memory, parameters)
         with Progress() as progress:
             representation = between.fit(row, btf, seed=args.seed, progress=progress, **parameters)
     write_representation(representation, out, json=args.json)

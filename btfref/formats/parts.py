@@ -61,13 +61,38 @@ class _InMemory:
         return self._values[:, :, first:last]
 
 
-def open_parts(btf: BTFStore | SampledBTF) -> PartReader:
+class _Repeated:
+    """A tile repeated until there are as many texels as wanted; the last repetition is cut off where it must be."""
+
+    def __init__(self, tile: PartReader, texels: tuple[int, int]) -> None:
+        self._tile, self.texels = tile, texels
+        self.views, self.lights = tile.views, tile.lights
+        self._rows, self._columns = (np.arange(n) % m for n, m in zip(texels, tile.texels, strict=True))
+
+    def view(self, view: int) -> np.ndarray:
+        return self._tile.view(view)[:, self._rows[:, None], self._columns]
+
+    def rows(self, first: int, last: int) -> np.ndarray:
+        rows, index = np.unique(self._rows[first:last], return_inverse=True)
+        values = self._tile.rows(int(rows[0]), int(rows[-1]) + 1)
+        return values[:, :, (rows - rows[0])[index][:, None], self._columns]
+
+
+def open_parts(btf: BTFStore | SampledBTF, texels: int | None = None) -> PartReader:
     """Parts of a `BTFStore` (which must be complete) or a `SampledBTF`.
+
+    Parameters
+    ----------
+    btf : BTFStore or SampledBTF
+    texels : int, optional
+        Rows and columns, if not its own: its tile is repeated.
 
     Returns
     -------
     PartReader
     """
+    if texels is not None:
+        return _Repeated(open_parts(btf), (texels, texels))
     if isinstance(btf, SampledBTF):
         return _InMemory(btf)
     if not btf.complete:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from btfref.registry import Method
     from btfref.representations.protocol import Representation
-    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Progress
 
 
@@ -33,14 +33,14 @@ ALBEDOS, ALBEDO_RULE = 128, (8, 28)
 
 
 def fit(
-    method: Method, btf: SampledBTF, *, seed: int = 0, progress: Progress | None = None, **parameters: Any
+    method: Method, btf: BTFBlocks, *, seed: int = 0, progress: Progress | None = None, **parameters: Any
 ) -> Representation:
     """Fit a method, and say in its file how wrong it is between the samples.
 
     Parameters
     ----------
     method : btfref.registry.Method
-    btf : SampledBTF
+    btf : BTFBlocks
     seed, progress, **parameters
         Of the method's ``fit``.
 
@@ -62,14 +62,14 @@ class Evaluates(Protocol):
         """See :meth:`btfref.representations.protocol.Representation.evaluate`."""
 
 
-def measure(representation: Evaluates, btf: SampledBTF, *, seed: int = 0) -> dict[str, float]:
+def measure(representation: Evaluates, btf: BTFBlocks, *, seed: int = 0) -> dict[str, float]:
     """Figures of a representation at random directions, uniform on the hemisphere, and at random texels.
 
     Parameters
     ----------
     representation : Representation
         Or anything with its ``evaluate``.
-    btf : SampledBTF
+    btf : BTFBlocks
         What it was fitted to.
     seed : int
         Of the lookups: equal seeds, equal lookups.
@@ -89,19 +89,22 @@ def measure(representation: Evaluates, btf: SampledBTF, *, seed: int = 0) -> dic
         uv, texel = _texels(rng, LOOKUPS, btf)
         w_light, w_view = _uniform(rng, LOOKUPS), _uniform(rng, LOOKUPS)
         found = representation.evaluate(uv, w_light, w_view)
-        raw = interpolated(btf, texel, w_light, w_view)
+        lookups = texel, w_light, w_view
         uv, texel = _texels(rng, ALBEDOS, btf)
         w_view = _uniform(rng, ALBEDOS)
         lights, weight = gauss_hemisphere(*ALBEDO_RULE)
         w_light = _turned(lights, 2 * np.pi * rng.random(ALBEDOS))
         albedo = weight @ representation.evaluate(uv[:, None], w_light, w_view[:, None])
-        data_albedo = weight @ interpolated(
-            btf,
+        albedos = (
             np.repeat(texel, len(lights)),
             w_light.reshape(-1, 3),
             np.repeat(w_view, len(lights), 0),
-        ).reshape(ALBEDOS, -1, 3)
-    largest = max(float(np.max(view)) for view in btf.values)
+        )
+        # All of them in one pass over the data.
+        everything = [np.concatenate(pair) for pair in zip(lookups, albedos, strict=True)]
+        data, largest = _from_data(btf, *everything)
+        raw = data[:LOOKUPS]
+        data_albedo = weight @ data[LOOKUPS:].reshape(ALBEDOS, -1, 3)
     size = np.abs(found)
     return {
         "peak": _over(size.max(), largest),
@@ -115,12 +118,12 @@ def measure(representation: Evaluates, btf: SampledBTF, *, seed: int = 0) -> dic
     }
 
 
-def interpolated(btf: SampledBTF, texel: np.ndarray, w_light: np.ndarray, w_view: np.ndarray) -> np.ndarray:
+def interpolated(btf: BTFBlocks, texel: np.ndarray, w_light: np.ndarray, w_view: np.ndarray) -> np.ndarray:
     """The data of some texels, interpolated over directions as by all tabulated methods.
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
     texel : ndarray of int, shape (n,)
         Flat indices.
     w_light, w_view : ndarray, shape (n, 3)
@@ -129,20 +132,35 @@ def interpolated(btf: SampledBTF, texel: np.ndarray, w_light: np.ndarray, w_view
     -------
     ndarray of float64, shape (n, 3)
     """
-    values = btf.values.reshape(*btf.values.shape[:2], -1, 3)
+    return _from_data(btf, texel, w_light, w_view)[0]
+
+
+def _from_data(
+    btf: BTFBlocks, texel: np.ndarray, w_light: np.ndarray, w_view: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """:func:`interpolated`, and the largest value of all, in one pass over the views."""
+    (view, view_weight), (light, light_weight) = (
+        btf.views.stencil(w_view),
+        btf.lights.stencil(w_light, hold=False),
+    )
+    found = np.zeros((*view.shape, light.shape[1], 3))
+    largest = -np.inf
+    for index in range(len(btf.views)):
+        values = btf.view(index)
+        largest = max(largest, float(np.max(values)))
+        lookup, place = np.nonzero(view == index)
+        flat = values.reshape(len(values), -1, 3)
+        found[lookup, place] = flat[light[lookup], texel[lookup, None]]
     result = np.zeros((len(texel), 3))
     for start in range(0, len(texel), CHUNK):
         part = slice(start, start + CHUNK)
-        view, view_weight = btf.views.stencil(w_view[part])
-        light, light_weight = btf.lights.stencil(w_light[part], hold=False)
-        found = values[view[:, :, None], light[:, None], texel[part, None, None]].astype(float)
-        result[part] = np.einsum("nv,nl,nvlc->nc", view_weight, light_weight, found)
-    return result
+        result[part] = np.einsum("nv,nl,nvlc->nc", view_weight[part], light_weight[part], found[part])
+    return result, largest
 
 
-def _texels(rng: np.random.Generator, n: int, btf: SampledBTF) -> tuple[np.ndarray, np.ndarray]:
+def _texels(rng: np.random.Generator, n: int, btf: BTFBlocks) -> tuple[np.ndarray, np.ndarray]:
     """Random texels' centres and flat indices."""
-    rows, columns = btf.values.shape[2:4]
+    rows, columns = btf.texels
     row, column = rng.integers(0, rows, n), rng.integers(0, columns, n)
     return np.stack([(column + 0.5) / columns, (row + 0.5) / rows], -1), row * columns + column
 

@@ -1,4 +1,4 @@
-"""Whether a fit stays within a budget of memory: fits hold the whole sampled BTF, and more than once."""
+"""Whether a fit stays within a budget of memory: what it holds of a sampled BTF at a time, and what it makes of it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from btfref.representations.protocol import FitMemory, StatesMemory
-from btfref.sampling import memory
+from btfref.sampling import SampledBTF, memory
+from btfref.sampling.blocks import StreamedBTF
 
 if TYPE_CHECKING:
     from btfref.registry import Method
@@ -44,15 +45,49 @@ def least_budget(method: Method, store: BTFStore, parameters: Facts | None = Non
         Bytes of the process at its peak.
     """
     pairs, texels = len(store.views) * len(store.lights), store.texels[0] * store.texels[1]
-    fitting = method.fitting
-    states = fitting.FIT_MEMORY if isinstance(fitting, StatesMemory) else UNKNOWN
+    states = stated(method)
     given = method.parameters | (parameters or {}) if states.scales or states.tables else {}
     blocks = float(states.blocks)
     for name in states.scales:
         blocks *= max(1.0, _number(given[name]) / _number(method.parameters[name]))
     tables = math.prod(_number(given[name]) for name in states.tables) if states.tables else 0
-    blocks += TABLE_COPIES * 4 * tables * (3 * pairs + texels)
-    return FIT_BASE + int(blocks + 3 * pairs * texels * (states.each + np.dtype(store.dtype).itemsize - HALF))
+    blocks += TABLE_COPIES * 4 * (tables + states.columns) * (3 * pairs + texels)
+    blocks += texels * (states.texel + len(store.views) * states.field)
+    wider = np.dtype(store.dtype).itemsize - HALF
+    if states.streams:
+        together = max(1, min(store.texels[0], states.texels // store.texels[1])) * store.texels[1]
+        blocks += 3 * pairs * together * (states.rows + wider if states.rows else 0)
+        blocks += 3 * len(store.lights) * texels * (states.view + wider if states.view else 0)
+        return FIT_BASE + int(blocks + 3 * pairs * texels * states.each)
+    return FIT_BASE + int(blocks + 3 * pairs * texels * (states.each + wider))
+
+
+def stated(method: Method) -> FitMemory:
+    """What the method's module says of its fit, or what counts where it says nothing."""
+    fitting = method.fitting
+    return fitting.FIT_MEMORY if isinstance(fitting, StatesMemory) else UNKNOWN
+
+
+def read_within(
+    method: Method, store: BTFStore, budget: int | None, parameters: Facts | None = None
+) -> SampledBTF | StreamedBTF:
+    """A store as a method fits it: part by part where it can, whole otherwise.
+
+    Parameters
+    ----------
+    method, store, budget, parameters
+        See :func:`check_budget`.
+
+    Raises
+    ------
+    InputError
+        The fit would take more than its budget, or the store is not complete.
+    """
+    check_budget(method, store, budget, parameters)
+    if not stated(method).streams:
+        return SampledBTF.load(store.path, variance=False)
+    budget = memory.default_budget() if budget is None else budget
+    return StreamedBTF(store, spare=budget - least_budget(method, store, parameters))
 
 
 def _number(value: object) -> float:

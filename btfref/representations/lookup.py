@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from btfref.numerics.sphere.directions import DirectionSet
     from btfref.representations.protocol import Representation
-    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Facts
 
 
@@ -188,11 +188,11 @@ def packed_arrays(arrays: Mapping[str, np.ndarray], **tables: np.ndarray) -> dic
     return {name: packed(tables.get(name, array)) for name, array in arrays.items()}
 
 
-def base_meta(method: str, btf: SampledBTF, parameters: Facts, *, filter_type: str = "bilinear") -> Facts:
+def base_meta(method: str, btf: BTFBlocks, parameters: Facts, *, filter_type: str = "bilinear") -> Facts:
     """The meta that every fit starts from."""
     return meta_for(
         method,
-        btf.values.shape[2:4],
+        btf.texels,
         btf.views,
         btf.lights,
         parameters,
@@ -270,7 +270,7 @@ def unit_peaks(axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return axes / peak[..., None], peak
 
 
-def refuse_not_finite(values: np.ndarray, btf: SampledBTF) -> None:
+def refuse_not_finite(values: np.ndarray, btf: BTFBlocks) -> None:
     """InputError for samples of a BTF that are not finite."""
     if not np.isfinite(values).all():
         raise InputError("the BTF holds a value that is not finite", file=btf.path)

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from btfref.representations.file.schema import Schema
-    from btfref.sampling.sampled_btf import SampledBTF
     from btfref.sampling.store.store import BTFStore
     from btfref.types import Facts, Progress
 
@@ -255,9 +254,14 @@ class FitModule(Protocol):
         """Named settings of :meth:`fit`; "paper" has those of the method's paper."""
 
     def fit(
-        self, btf: SampledBTF, *, seed: int = 0, progress: Progress | None = None, **parameters: Any
+        self, btf: Any, *, seed: int = 0, progress: Progress | None = None, **parameters: Any
     ) -> Representation:
         """A representation of a sampled BTF; same seed, same result.
+
+        Parameters
+        ----------
+        btf : btfref.sampling.sampled_btf.SampledBTF or btfref.sampling.blocks.BTFBlocks
+            The latter, which has no ``values``, is given to modules whose ``FIT_MEMORY`` streams and to no others.
 
         Raises
         ------
@@ -282,19 +286,40 @@ class FitMemory:
     Attributes
     ----------
     each : float
-        Bytes per value of a sampled BTF of half floats, the BTF itself included.
+        Bytes per value of a sampled BTF of half floats; the BTF itself included, unless the fit streams.
     blocks : int
         Bytes that do not grow with the BTF, for the default parameters.
     scales : tuple of str
         Parameters that the blocks are in proportion to, where they are larger than by default.
     tables : tuple of str
         Parameters whose product is the number of tables over pairs of directions, each with a weight for all texels.
+    view : float
+        Bytes per value of a single view, of a fit that reads the BTF view by view.
+    rows : float
+        Bytes per value of the rows that are read together, of a fit that reads the BTF so; in any case one row.
+    texels : int
+        As many texels as such rows have at most, where one row has not more.
+    columns : int
+        Further tables, whatever the parameters are.
+    texel, field : float
+        Bytes per texel, and per texel and view.
     """
 
-    each: float
+    each: float = 0.0
     blocks: int = 0
     scales: tuple[str, ...] = ()
     tables: tuple[str, ...] = ()
+    view: float = 0.0
+    rows: float = 0.0
+    texels: int = 0
+    columns: int = 0
+    texel: float = 0.0
+    field: float = 0.0
+
+    @property
+    def streams(self) -> bool:
+        """Whether the fit reads the BTF part by part, so that it need not be in memory."""
+        return self.view > 0 or self.rows > 0
 
 
 @runtime_checkable

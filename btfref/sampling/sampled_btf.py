@@ -14,6 +14,7 @@ from btfref.conventions import in_one_line
 from btfref.errors import InputError
 from btfref.numerics.sphere.directions import DirectionSet, checked, directions
 from btfref.outputs import refuse_existing
+from btfref.sampling.blocks import refuse_incomplete
 from btfref.sampling.store.layout import TILE, check_finite, remove_leftovers, replace_store
 from btfref.sampling.store.store import create_store, open_store
 from btfref.types import Facts
@@ -114,6 +115,23 @@ class SampledBTF:
         """Rows and columns."""
         return self.values.shape[2:4]
 
+    @property
+    def dtype(self) -> np.dtype:
+        """Type of the values."""
+        return self.values.dtype
+
+    def claim(self, size: int) -> bool:
+        """Always: who holds all values may hold more; see :class:`btfref.sampling.blocks.BTFBlocks`."""
+        return True
+
+    def view(self, view: int) -> np.ndarray:
+        """Values of a view, shape (lights, rows, columns, 3), without a copy."""
+        return self.values[view]
+
+    def rows(self, first: int, last: int) -> np.ndarray:
+        """Values of the rows ``first … last − 1``, shape (views, lights, last − first, columns, 3), without a copy."""
+        return self.values[:, :, first:last]
+
     @classmethod
     def load(
         cls,
@@ -148,17 +166,8 @@ class SampledBTF:
             Not a store, an incomplete or damaged one, or one that holds values which are not finite.
         """
         store = open_store(path)
-        if not partial and not store.complete:
-            missing = store.attributes.get("parent", {}).get("images_missing")
-            raise InputError(
-                f"incomplete: {missing} images are missing in what it was made from"
-                if missing
-                else "incomplete: its run was interrupted; start the same command again to finish it",
-                file=store.path,
-                field="coverage",
-                got=f"{store.coverage.mean():.1%}",
-                expected="100%",
-            )
+        if not partial:
+            refuse_incomplete(store)
         values, spread = store.read(views=views, lights=lights, rows=rows, columns=columns, variance=variance)
         parts = {}
         for name, index in (("views", views), ("lights", lights)):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from btfref.registry import method
-from btfref.representations.fit_memory import check_budget
+from btfref.representations.fit_memory import read_within
 from btfref.representations.protocol import Representation
-from btfref.sampling import SampledBTF, open_store
+from btfref.sampling import open_store
 from btfref.types import PathLike, Progress
 
 #: Bytes of the table of `raw`: 16-bit floats, four channels. Up to here a sampled BTF is shown as it is.
@@ -44,8 +44,7 @@ def quick_representation(
     table = views * lights * rows * columns * 4 * 2
     key, settings = ("raw", {}) if table <= AS_IT_IS else ("lpca", dict(QUICK))
     row = method(key)
-    check_budget(row, store, memory, settings)
-    btf = SampledBTF.load(path, variance=False)
+    btf = read_within(row, store, memory, settings)
     fitted = row.fitting.fit(btf, **({"progress": progress} if progress else {}), **settings)
     if key == "raw":
         return fitted, "A sampled BTF, shown as it is (method raw)."

@@ -42,6 +42,7 @@ def export_bonn(
     error: float | None = None,
     colour_model: int = 0,
     scalar: int = 2,
+    texels: int | None = None,
     memory: int = MEMORY,
     progress: Progress | None = None,
 ) -> Facts:
@@ -62,6 +63,9 @@ def export_bonn(
         0: R, G, B. 11: log Y, U/Y, V/Y, as UBO2014; values must have positive luminance.
     scalar : {2, 4}
         Bytes of a factor.
+    texels : int, optional
+        Rows and columns of the file, if not those of the BTF: its tile is repeated. A BTF of known values then stands
+        for one as large as those that are measured.
     memory : int
         Bytes to hold at a time (BDI).
 
@@ -77,7 +81,9 @@ def export_bonn(
     """
     if family not in ("DFMF", "BDI"):
         raise InputError("family", field="family", got=repr(family), expected="DFMF or BDI")
-    source, path = open_parts(btf), Path(path)
+    if texels is not None and (isinstance(texels, bool) or not isinstance(texels, int) or texels < 1):
+        raise InputError("texels of the file", field="texels", got=texels, expected="at least 1")
+    source, path = open_parts(btf, texels), Path(path)
     with new_file(path) as draft, draft.open("wb") as stream:
         if family == "BDI":
             facts = _write_bdi(stream, source, memory, progress)

@@ -299,6 +299,8 @@ def peak(shape: tuple[int, ...], itemsize: int, settings: Facts) -> int:
     """Bytes that :func:`export` holds at its peak: ``peak`` of a `btfref.formats.source.Format`."""
     from btfref.formats.bonn.export import LARGEST_RANK, OVERSAMPLED, SCAN_LINES
 
+    if settings.get("texels"):
+        shape = (*shape[:2], settings["texels"], settings["texels"], 3)
     n_views, n_lights, rows, columns, _ = shape
     pairs, texels = n_views * n_lights, rows * columns
     if settings.get("family") == "BDI":
@@ -318,5 +320,5 @@ FORMAT = Format(
     open_bonn,
     export=export,
     peak=peak,
-    settings=frozenset({"family", "components", "error", "colour_model", "scalar", "memory"}),
+    settings=frozenset({"family", "components", "error", "colour_model", "scalar", "texels", "memory"}),
 )

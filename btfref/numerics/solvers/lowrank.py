@@ -71,29 +71,6 @@ def range_basis(
     return _rotated(matrix, _orthonormal(sample.T), rank)
 
 
-def refined_basis(matrix: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A basis near the dominant row space, after one step of subspace iteration.
-
-    Parameters
-    ----------
-    matrix : ndarray of float32, shape (n, d)
-    basis : ndarray of float32, shape (rank, d)
-        Approximately spans the dominant row space.
-
-    Returns
-    -------
-    basis, coordinates
-        As :func:`range_basis`, of rank at most ``min(rank, n)``; zero rows where ``matrix`` has a lower rank.
-    """
-    rank = min(len(basis), *matrix.shape)
-    sample = product(_orthonormal(product(matrix, basis.T))[:, :rank].T, matrix)
-    basis, coordinates = _rotated(matrix, _orthonormal(sample.T), rank)
-    energy = (coordinates.astype(float) ** 2).sum(0)
-    # Relative to the largest, float32 products carry nothing below this.
-    keep = energy > 1e-7 * energy.max(initial=0)
-    return basis * keep[:, None], coordinates * keep
-
-
 def _rotated(matrix: np.ndarray, columns: np.ndarray, rank: int) -> tuple[np.ndarray, np.ndarray]:
     """The leading principal directions within the span of orthonormal columns, and the coordinates along them."""
     projected = product(matrix, columns)

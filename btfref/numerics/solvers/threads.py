@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
+from typing import TypeVar
 
 import numpy as np
 
-#: Threads that :func:`product` may use: those of BLAS before :func:`reproducible` took them.
+T = TypeVar("T")
+
+#: Threads that :func:`in_parallel` may use: those of BLAS before :func:`reproducible` took them.
 _WORKERS: ContextVar[int] = ContextVar("_WORKERS", default=1)
+
+#: And these threads themselves: a pass over many small blocks would spend its time on starting them.
+_POOL: ContextVar[ThreadPoolExecutor | None] = ContextVar("_POOL", default=None)
 
 #: Rows, or columns, of a block of :func:`product`: enough for a BLAS call to be worth it; the same on all machines.
 BLOCK = 512
@@ -41,19 +47,44 @@ def reproducible() -> Iterator[None]:
 
     threads = [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
     token = _WORKERS.set(max(_WORKERS.get(), *threads, 1))
+    outer = _POOL.get()
+    pool = outer or ThreadPoolExecutor(_WORKERS.get())
+    of_pool = _POOL.set(pool)
     try:
         with threadpool_limits(limits=1):
             yield
     finally:
         _WORKERS.reset(token)
+        _POOL.reset(of_pool)
+        if outer is None:
+            pool.shutdown()
 
 
-def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def in_parallel(action: Callable[[T], object], items: Iterable[T]) -> None:
+    """Do something for each of some items, on several threads within :func:`reproducible`.
+
+    Parameters
+    ----------
+    action : callable
+        Independent of the other items, so that the number of threads makes no difference.
+    items : iterable
+    """
+    todo, pool = list(items), _POOL.get()
+    if pool is None or min(_WORKERS.get(), len(todo)) <= 1:
+        for item in todo:
+            action(item)
+    else:
+        list(pool.map(action, todo))
+
+
+def product(a: np.ndarray, b: np.ndarray, *, rows: int = BLOCK) -> np.ndarray:
     """``a @ b`` in blocks of rows of ``a``, or of columns of ``b`` where there are more, on several threads.
 
     Parameters
     ----------
     a, b : ndarray, shapes (n, k), (k, m)
+    rows : int
+        Rows, or columns, of a block.
 
     Returns
     -------
@@ -65,19 +96,12 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     tall = n >= m
 
     def block(start: int) -> None:
-        part = slice(start, start + BLOCK)
+        part = slice(start, start + rows)
         if tall:
             np.matmul(a[part], b, out=result[part])
         else:
             # Contiguous, so that no part is copied and no path through BLAS depends on strides.
             result[:, part] = a @ np.ascontiguousarray(b[:, part])
 
-    starts = range(0, n if tall else m, BLOCK)
-    workers = min(_WORKERS.get(), len(starts))
-    if workers <= 1:
-        for start in starts:
-            block(start)
-    else:
-        with ThreadPoolExecutor(workers) as pool:
-            list(pool.map(block, starts))
+    in_parallel(block, range(0, n if tall else m, rows))
     return result

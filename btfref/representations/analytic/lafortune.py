@@ -34,12 +34,12 @@ if TYPE_CHECKING:
     from btfref.numerics.solvers.levenberg import Model, Samples
     from btfref.numerics.sphere.directions import DirectionSet
     from btfref.representations.analytic.light_functions import HeldStencils
-    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Facts, JitArray, Progress
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(3.8, 220 << 20, scales=("lobes",))
+FIT_MEMORY = FitMemory(blocks=220 << 20, scales=("lobes",), rows=4, texels=light_functions.BLOCK, texel=400)
 
 #: "paper": Table 1's four lobes, in floats.
 PRESETS = {"paper": {"lobes": 4, "storage": "float"}}
@@ -265,7 +265,7 @@ def lobe_maps(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 @reproducible()
 def fit(
-    btf: SampledBTF,
+    btf: BTFBlocks,
     *,
     seed: int = 0,
     progress: Progress | None = None,
@@ -277,7 +277,7 @@ def fit(
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
     seed : int
         Unused: nothing is random.
     progress : callable, optional
@@ -316,7 +316,7 @@ def fit(
 def fit_texels(
     made: type[light_functions.M],
     method: str,
-    btf: SampledBTF,
+    btf: BTFBlocks,
     fit_block: Callable[[np.ndarray], tuple[BatchFit, dict[str, np.ndarray]]],
     parameters: Facts,
     progress: Progress | None,
@@ -330,7 +330,7 @@ def fit_texels(
     fit_block : callable
         ``luminance (n_views, n_lights, n) -> (BatchFit, {name: (n, width) further maps})``.
     """
-    rows, columns = btf.values.shape[2:4]
+    rows, columns = btf.texels
     blocks, fits = [], []
     for _, luminance, chroma in light_functions.luminance_blocks(btf, progress, "lobes"):
         result, further = fit_block(luminance)

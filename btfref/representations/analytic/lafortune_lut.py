@@ -25,12 +25,14 @@ if TYPE_CHECKING:
 
     from btfref.numerics.solvers.levenberg import BatchFit
     from btfref.representations.analytic.light_functions import HeldStencils
-    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Facts, Progress
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(3.8, 220 << 20, scales=("lobes",))
+FIT_MEMORY = FitMemory(
+    blocks=220 << 20, scales=("lobes",), rows=4, texels=light_functions.BLOCK, texel=400, field=12
+)
 
 #: "paper": Table 1's four lobes, in floats.
 PRESETS: dict[str, Facts] = {"paper": {"lobes": 4, "bounded": False, "storage": "float"}}
@@ -79,7 +81,7 @@ class Representation(light_functions.AnalyticMaps):
 
 @reproducible()
 def fit(
-    btf: SampledBTF,
+    btf: BTFBlocks,
     *,
     seed: int = 0,
     progress: Progress | None = None,
@@ -93,7 +95,7 @@ def fit(
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
     seed : int
         Unused: nothing is random.
     progress : callable, optional
@@ -142,7 +144,7 @@ def fit(
 
 
 def view_factor(
-    luminance: np.ndarray, parameters: np.ndarray, btf: SampledBTF, *, bounded: bool = False
+    luminance: np.ndarray, parameters: np.ndarray, btf: BTFBlocks, *, bounded: bool = False
 ) -> np.ndarray:
     """Least-squares factor of each view and texel, ``Σ_l B M / Σ_l M²`` in [0, 8]; 1 where the model is 0.
 
@@ -151,7 +153,7 @@ def view_factor(
     luminance : ndarray, shape (view, light, n)
     parameters : ndarray, shape (n, 1 + 5 k)
         Of the lobes.
-    btf : SampledBTF
+    btf : BTFBlocks
     bounded : bool
         See :func:`fit`.
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from btfref.representations.protocol import Representation
-    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Facts, Progress
 
 
@@ -121,20 +121,20 @@ def held(w: ArrayLike, edge: float) -> tuple[np.ndarray, np.ndarray]:
     return raised, np.where(below, z / max(edge, 1e-30), 1)
 
 
-def edge_constants(btf: SampledBTF) -> dict[str, float]:
+def edge_constants(btf: BTFBlocks) -> dict[str, float]:
     """The smallest measured cosines; 0, which holds nothing, where they reach the horizon."""
     edges = {"light_edge": btf.lights.vectors[:, 2].min(), "view_edge": btf.views.vectors[:, 2].min()}
     return {name: float(np.float32(edge)) if edge > 1e-6 else 0.0 for name, edge in edges.items()}
 
 
 def luminance_blocks(
-    btf: SampledBTF, progress: Progress | None = None, label: str = "fit"
+    btf: BTFBlocks, progress: Progress | None = None, label: str = "fit"
 ) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
     """Luminance and chroma of the texels, some at a time.
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
     progress : callable, optional
         ``progress(done, total, label)`` after each block.
 
@@ -151,10 +151,10 @@ def luminance_blocks(
     InputError
         For values that are not finite.
     """
-    n_views, n_lights, rows, columns, _ = btf.values.shape
+    n_views, n_lights, (rows, columns) = len(btf.views), len(btf.lights), btf.texels
     step = max(1, BLOCK // columns)
     for first in range(0, rows, step):
-        block = np.asarray(btf.values[:, :, first : first + step], np.float32).reshape(
+        block = np.asarray(btf.rows(first, min(first + step, rows)), np.float32).reshape(
             n_views, n_lights, -1, 3
         )
         refuse_not_finite(block, btf)
@@ -168,7 +168,7 @@ def luminance_blocks(
             progress(part.stop, rows * columns, label)
 
 
-def mean_absolute_error(representation: AnalyticMaps, btf: SampledBTF) -> np.ndarray:
+def mean_absolute_error(representation: AnalyticMaps, btf: BTFBlocks) -> np.ndarray:
     """ε of each texel: mean of |B − model| in luminance over all measured pairs; the paper's eq. 2.
 
     Returns
@@ -177,7 +177,7 @@ def mean_absolute_error(representation: AnalyticMaps, btf: SampledBTF) -> np.nda
         In units of the radiance factor π B, where a white diffuser under perpendicular light has 1.
     """
     n_views = len(btf.views)
-    result = np.zeros(int(np.prod(btf.values.shape[2:4])))
+    result = np.zeros(int(np.prod(btf.texels)))
     for part, luminance, _ in luminance_blocks(btf):
         texels = np.arange(part.start, part.stop)
         for view in range(n_views):
@@ -186,7 +186,7 @@ def mean_absolute_error(representation: AnalyticMaps, btf: SampledBTF) -> np.nda
     return result
 
 
-def fit_report(representation: AnalyticMaps, btf: SampledBTF) -> dict[str, float]:
+def fit_report(representation: AnalyticMaps, btf: BTFBlocks) -> dict[str, float]:
     """JSON-able average, least and largest ε over texels, as Table 1 of the paper has them."""
     error = mean_absolute_error(representation, btf)
     return {"average": float(error.mean()), "minimum": float(error.min()), "maximum": float(error.max())}
@@ -222,7 +222,7 @@ def memory_report(maps: dict[str, np.ndarray], texels: int, n_views: int | None 
 def finished(
     made: type[M],
     method: str,
-    btf: SampledBTF,
+    btf: BTFBlocks,
     maps: dict[str, np.ndarray],
     parameters: Facts,
     *,
@@ -238,7 +238,7 @@ def finished(
     made : type
         Of the representation.
     method : str
-    btf : SampledBTF
+    btf : BTFBlocks
         What was fitted.
     maps : dict of str to ndarray
         Stored ones, without the direction tables.

@@ -40,12 +40,12 @@ if TYPE_CHECKING:
     from btfref.numerics.solvers.levenberg import BatchFit, Model, Samples
     from btfref.numerics.sphere.directions import DirectionSet
     from btfref.representations.analytic.light_functions import HeldStencils
-    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Facts, JitArray, Progress
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(3.6, 560 << 20, scales=("lobes",))
+FIT_MEMORY = FitMemory(blocks=560 << 20, scales=("lobes",), rows=4, texels=light_functions.BLOCK, field=75)
 
 #: "paper": two lobes in floats.
 PRESETS = {"paper": {"lobes": 2, "storage": "float"}}
@@ -213,7 +213,7 @@ def lobe_model(module: ModuleType, data: np.ndarray, lights: np.ndarray, n_lobes
 
 @reproducible()
 def fit(
-    btf: SampledBTF,
+    btf: BTFBlocks,
     *,
     seed: int = 0,
     progress: Progress | None = None,
@@ -229,7 +229,7 @@ def fit(
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
     seed : int
         Unused: nothing is random.
     progress : callable, optional
@@ -262,7 +262,7 @@ def fit(
         raise InputError(
             "a parameter is out of range", field="diffuse_quantile", got=diffuse_quantile, expected="0 to 1"
         )
-    n_views, _, rows, columns, _ = btf.values.shape
+    n_views, (rows, columns) = len(btf.views), btf.texels
     maps: dict[str, np.ndarray] = {
         "lobes": np.zeros((rows * columns, n_views, 4 * n_lobes), np.float32),
         "colour": np.zeros((rows * columns, 4), np.float32),

@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from btfref.representations.analytic.light_functions import HeldStencils
-    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Facts, Progress
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(3.8, 170 << 20)
+FIT_MEMORY = FitMemory(rows=6, texels=light_functions.BLOCK, field=61)
 
 #: "paper": all 81 views in floats.
 PRESETS = {"paper": {"storage": "float"}}
@@ -116,7 +116,7 @@ def light_operator(lights: np.ndarray) -> tuple[np.ndarray, Facts]:
 
 @reproducible()
 def fit(
-    btf: SampledBTF,
+    btf: BTFBlocks,
     *,
     seed: int = 0,
     progress: Progress | None = None,
@@ -127,7 +127,7 @@ def fit(
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
     seed : int
         Unused: nothing is random.
     progress : callable, optional
@@ -150,7 +150,7 @@ def fit(
     """
     # All views share the measured lights, hence one operator.
     operator, conditioning = light_operator(btf.lights.vectors)
-    n_views, _, rows, columns, _ = btf.values.shape
+    n_views, (rows, columns) = len(btf.views), btf.texels
     polynomial = np.zeros((rows * columns, n_views, 6), np.float32)
     chroma = np.zeros((rows * columns, 3))
     for part, luminance, colour in light_functions.luminance_blocks(btf, progress, "polynomials"):

@@ -48,14 +48,14 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
     from btfref.representations.factored.fit import Step
-    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Progress
 
 
 __all__ = ["FIT_MEMORY", "PRESETS", "Representation", "fit"]
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(6.2)
+FIT_MEMORY = FitMemory(rows=12, texels=1, texel=83e3)
 
 #: "paper": factors as the chain leaves them, all in 8 bits, scales from the normalisation alone.
 PRESETS = {"paper": {"sweeps": 0, "rescale": False, "storage": "byte", "code": "linear"}}
@@ -238,7 +238,7 @@ def chain(data: np.ndarray, resampling: Resampling, terms: int, floor: float) ->
 
 @reproducible()
 def fit(
-    btf: SampledBTF,
+    btf: BTFBlocks,
     *,
     seed: int = 0,
     progress: Progress | None = None,
@@ -261,7 +261,7 @@ def fit(
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
         Negative values count as 0.
     seed : int
         Of the clustering.
@@ -303,7 +303,7 @@ def fit(
 
 
 def factorize(
-    btf: SampledBTF,
+    btf: BTFBlocks,
     *,
     step: Step = lambda label: None,
     difference: bool = False,
@@ -319,7 +319,7 @@ def factorize(
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
     step : callable
         ``step(label)``, called now and then.
     difference : bool

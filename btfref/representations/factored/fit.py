@@ -11,11 +11,12 @@ import numpy as np
 from btfref.errors import InputError
 from btfref.representations.factored.definition import texel_parts
 from btfref.representations.lookup import positive_integer, refuse_not_finite
+from btfref.sampling.blocks import texel_values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Facts, Progress
 
 
@@ -81,13 +82,13 @@ def checked_map_size(map_size: object) -> int:
 
 
 def factorized(
-    btf: SampledBTF, counts: Mapping[str, int], map_size: int, step: Step, factorize: FactorizePart
+    btf: BTFBlocks, counts: Mapping[str, int], map_size: int, step: Step, factorize: FactorizePart
 ) -> tuple[dict[str, np.ndarray], Facts]:
     """Factorize all texels, part by part.
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
     counts : dict of str to int
         Terms of each factor.
     map_size : int
@@ -124,12 +125,12 @@ def factorized(
     return maps, {name: value / energy if energy > 0 else 0.0 for name, value in squared.items()}
 
 
-def unit_tables(btf: SampledBTF, texels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def unit_tables(btf: BTFBlocks, texels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Tables of some texels with a mean of 1, and their means.
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
     texels : ndarray of int, shape (k,)
         Flat indices.
 
@@ -144,10 +145,8 @@ def unit_tables(btf: SampledBTF, texels: np.ndarray) -> tuple[np.ndarray, np.nda
     InputError
         For a value that is not finite.
     """
-    views, lights = btf.values.shape[:2]
-    tables = (
-        btf.values.reshape(views, lights, -1, 3)[:, :, texels].astype(np.float32).reshape(views, lights, -1)
-    )
+    values = texel_values(btf, texels)
+    tables = values.astype(np.float32).reshape(*values.shape[:2], -1)
     refuse_not_finite(tables, btf)
     tables = np.maximum(tables, 0)
     mean = tables.mean((0, 1))

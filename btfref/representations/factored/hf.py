@@ -32,14 +32,14 @@ if TYPE_CHECKING:
 
     from btfref.numerics.sphere.directions import DirectionSet
     from btfref.representations.factored.fit import Step
-    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Facts, Progress
 
 
 __all__ = ["FIT_MEMORY", "PRESETS", "Representation", "fit"]
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(6.2)
+FIT_MEMORY = FitMemory(rows=12, texels=1, texel=83e3)
 
 #: "paper": factors as the system leaves them, all in 8 bits, scales from the normalisation alone.
 PRESETS = {
@@ -162,7 +162,7 @@ def logarithms(tables: np.ndarray, floor: float) -> np.ndarray:
 
 @reproducible()
 def fit(
-    btf: SampledBTF,
+    btf: BTFBlocks,
     *,
     seed: int = 0,
     progress: Progress | None = None,
@@ -181,7 +181,7 @@ def fit(
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
         Negative values count as 0.
     seed : int
         Of the held-out samples and of the clustering.
@@ -214,7 +214,7 @@ def fit(
 
 
 def factorize(
-    btf: SampledBTF,
+    btf: BTFBlocks,
     *,
     seed: int = 0,
     step: Step = lambda label: None,
@@ -227,7 +227,7 @@ def factorize(
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
     seed : int
         Of the held-out samples.
     step : callable

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from btfref.representations.factored.fit import Factors, Step
-    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Facts, Progress
 
 
@@ -165,7 +165,7 @@ def stored_maps(name: str, maps: np.ndarray, storage: str, power: int) -> np.nda
 
 
 def fitted(
-    btf: SampledBTF,
+    btf: BTFBlocks,
     factorize: Callable[[Step], Factors],
     storing: Storing,
     *,
@@ -177,7 +177,7 @@ def fitted(
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
     factorize : callable
         ``step -> Factors``; calls ``step(label)`` for each part of the texels and for what else it does.
     storing : Storing
@@ -257,13 +257,13 @@ def cluster(
 
 
 def store(
-    btf: SampledBTF, codebooks: Codebooks, storing: Storing, *, seed: int = 0, step: Step = lambda label: None
+    btf: BTFBlocks, codebooks: Codebooks, storing: Storing, *, seed: int = 0, step: Step = lambda label: None
 ) -> Representation:
     """A stored representation.
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
         What the codebooks stand for.
     codebooks : Codebooks
     storing : Storing
@@ -320,7 +320,7 @@ def store(
 
 
 def _moments(
-    btf: SampledBTF,
+    btf: BTFBlocks,
     arrays: dict[str, np.ndarray],
     constants: Facts,
     scale: np.ndarray,

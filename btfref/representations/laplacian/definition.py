@@ -19,7 +19,7 @@ from btfref.representations.protocol import FitMemory
 __all__ = ["FIT_MEMORY", "PRESETS", "Representation", "fit"]
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(20.5)
+FIT_MEMORY = FitMemory(0.022, view=28, columns=200)
 
 #: "paper": λ_max = 4, 8 + 2 + 2 components a level, Phong mean, 3 × 3 box, nearest texels and directions, in floats.
 PRESETS = {

@@ -2,29 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.errors import InputError
 from btfref.numerics.phong import fit_phong, phong
-from btfref.numerics.pyramid import expand_image, gaussian_pyramid, level_shapes
-from btfref.numerics.solvers.lowrank import range_basis, texel_matrix
+from btfref.numerics.pyramid import level_shapes
+from btfref.numerics.solvers.streaming import OVERSAMPLING, ROWS, GramPass
 from btfref.numerics.solvers.threads import product, reproducible
-from btfref.numerics.ycbcr import CHANNELS, FROM_RGB, RGB_METRIC, RGB_WEIGHT
+from btfref.numerics.ycbcr import CHANNELS, RGB_METRIC, RGB_WEIGHT
 from btfref.representations.analytic.light_functions import edge_constants
+from btfref.representations.columns import Steps
+from btfref.representations.laplacian.images import PyramidImages, expanded
 from btfref.representations.laplacian.levels import Representation, level_constants
-from btfref.representations.lookup import base_meta, direction_arrays, refuse_not_finite, stored, unit_peaks
+from btfref.representations.lookup import base_meta, direction_arrays, stored, unit_peaks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.representations.laplacian.images import Images
+    from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Facts, Progress
 
 
 #: Numbers of components of Y, Cb and Cr at each level (section 3.3 of the paper).
 COMPONENTS = (8, 2, 2)
+
+#: How often a level's differences are gone through for their components; once more for the error that these leave.
+PASSES = 2
 
 #: Most components of one channel of a level where their number is chosen.
 LARGEST = 64
@@ -45,7 +52,7 @@ _CHOICES = {
 
 @reproducible()
 def fit(
-    btf: SampledBTF,
+    btf: BTFBlocks,
     *,
     seed: int = 0,
     progress: Progress | None = None,
@@ -63,7 +70,7 @@ def fit(
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
     seed : int
         Of the randomized subspace iteration; same seed, same result.
     progress : callable, optional
@@ -112,20 +119,24 @@ def fit(
             # Errors of coarser levels add up at the finer ones, where nothing corrects them.
             raise InputError("a target needs closed prediction", field="prediction", got=prediction)
     filter_type = filter_type or ("nearest" if reduction == "box" else "bilinear")
-    texels = btf.values.shape[2:4]
-    shapes = level_shapes(texels, None if levels is None else int(levels))
-    report = progress or (lambda *_: None)
-    report(0, len(shapes) + 1, "pyramid")
-    images = _pyramids(btf, len(shapes), reduction)
-    top = len(shapes) - 1
-    maps, average, facts = _mean_maps(btf, [image[top] for image in images], mean, storage)
+    shapes = level_shapes(btf.texels, None if levels is None else int(levels))
+    steps = Steps(progress, 0)
+    images = PyramidImages(btf, len(shapes), reduction, steps)
+    # A pass for the pyramids, and those for each level that is not kept.
+    steps.total = len(btf.views) * (1 + (PASSES + 1) * images.first_kept) + len(shapes)
+    steps.begin("pyramid")
+    energy, table = _first_pass(images)
+    maps, average, facts = _mean_maps(btf, table, mean, storage)
     rng = np.random.default_rng(seed)
-    state = _Levels(images, average, prediction == "closed", filter_type, storage, len(btf.views), rng)
+    state = _Levels(
+        images, energy, average, prediction == "closed", filter_type, storage, len(btf.views), rng
+    )
     described: list[Facts] = []
-    for k in range(top, -1, -1):
-        report(top - k + 1, len(shapes) + 1, f"level {k}")
+    for k in range(len(shapes) - 1, -1, -1):
+        steps.begin(f"level {k}")
         own = state.compress(k, counts, target_error)
         described.insert(0, {"rows": shapes[k][0], "columns": shapes[k][1], "components": own})
+        steps()
     maps = state.maps | maps
     parameters = {
         "levels": len(shapes),
@@ -146,7 +157,7 @@ def fit(
     }
     meta["fit"] = {**state.errors(), **facts}
     if counts == COMPONENTS:
-        meta["published_layout"] = packed_layout(len(shapes), texels, len(btf.views), len(btf.lights))
+        meta["published_layout"] = packed_layout(len(shapes), btf.texels, len(btf.views), len(btf.lights))
     return Representation(maps | direction_arrays(btf.views, btf.lights), meta)
 
 
@@ -191,20 +202,21 @@ def _counts(components: object) -> tuple[int, int, int]:
     return y, cb, cr
 
 
-def _pyramids(btf: SampledBTF, n_levels: int, reduction: str) -> list[list[np.ndarray]]:
-    """Gaussian pyramids [channel][level] of shape (rows, columns, pairs), float32."""
-    rows, columns = btf.values.shape[2:4]
-    matrix = texel_matrix(btf.values)
-    refuse_not_finite(matrix, btf)
-    matrix = matrix.reshape(rows, columns, -1, 3)
-    return [gaussian_pyramid(matrix @ row.astype(np.float32), n_levels, reduction) for row in FROM_RGB]
+def _first_pass(images: PyramidImages) -> tuple[list[np.ndarray], np.ndarray]:
+    """Inner products of the channels at each level (3, 3), and the mean of the coarsest, (pairs, 3) float64."""
+    energy = [np.zeros((3, 3)) for _ in images.shapes]
+    means = []
+    for levels in images.fill():
+        for total, image in zip(energy, levels, strict=True):
+            total += _gram(list(np.moveaxis(image, 1, 0)))
+        means.append(levels[-1].mean(2, dtype=float))
+    return energy, np.concatenate(means)
 
 
 def _mean_maps(
-    btf: SampledBTF, tops: list[np.ndarray], choice: str, storage: str
+    btf: BTFBlocks, table: np.ndarray, choice: str, storage: str
 ) -> tuple[dict[str, np.ndarray], list[np.ndarray], Facts]:
     """Mean of the coarsest level: maps, its values [channel] at all pairs as stored, and facts on the Phong model."""
-    table = np.stack([top.mean((0, 1), dtype=float) for top in tops], -1)
     shape = len(btf.views), len(btf.lights), 3
     rms = np.sqrt((table**2 @ RGB_WEIGHT).mean())
     facts = {}
@@ -229,8 +241,9 @@ class _Levels:
 
     Parameters
     ----------
-    images : list of list of ndarray
-        Gaussian pyramids [channel][level], shape (rows, columns, pairs).
+    images : PyramidImages
+    energy : list of ndarray (3, 3)
+        Inner products of the channels at each level.
     average : list of ndarray, shape (pairs,)
         Mean of the coarsest level, [channel].
     closed : bool
@@ -241,7 +254,8 @@ class _Levels:
 
     def __init__(
         self,
-        images: list[list[np.ndarray]],
+        images: PyramidImages,
+        energy: list[np.ndarray],
         average: list[np.ndarray],
         closed: bool,
         filter_type: str,
@@ -249,62 +263,91 @@ class _Levels:
         n_views: int,
         rng: np.random.Generator,
     ) -> None:
-        self.images, self.average, self.closed = images, average, closed
+        self.images, self.closed = images, closed
+        self.energy = [float((RGB_METRIC * gram).sum()) for gram in energy]
         self.filter_type, self.storage, self.n_views, self.rng = filter_type, storage, n_views, rng
         self.maps: dict[str, np.ndarray] = {}
         self.level_errors: dict[int, float] = {}
         self.gram = np.zeros((3, 3))
-        #: [channel]: coarser levels as they are stored, and as they were.
-        self.kept: list[list[StoredChannel]] = [[] for _ in CHANNELS]
-        self.exact: list[list[np.ndarray]] = [[] for _ in CHANNELS]
+        self.average = np.stack(average, 1)
+        #: [channel]: coarser levels as they are stored: weights (component, texels) of which level, basis.
+        self.kept: list[list[tuple[int, np.ndarray, np.ndarray]]] = [[] for _ in CHANNELS]
 
-    def _predicted(self, channel: int, shape: tuple[int, ...], *, exact: bool) -> np.ndarray:
-        """A level from the coarser ones, shape (texels, pairs)."""
-        total = np.zeros((int(np.prod(shape)), 1), np.float32) + self.average[channel]
-        if exact:
-            for level in self.exact[channel]:
-                total += expand_image(level, shape, self.filter_type).reshape(total.shape)
-        else:
-            for weights, basis in self.kept[channel]:
-                total += product(
-                    expand_image(weights, shape, self.filter_type).reshape(len(total), -1), basis
-                )
-        return total
+    def _model(self, k: int) -> Model:
+        """What the levels that are stored say of level k."""
+        shapes = self.images.shapes
+        tables: list[tuple[np.ndarray, np.ndarray]] = []
+        for channel, kept in enumerate(self.kept):
+            weights = [np.ones((1, self.images.texels(k)), np.float32)]
+            weights += [expanded(w, shapes[j], shapes[k], self.filter_type) for j, w, _ in kept]
+            basis = [self.average[:, channel : channel + 1], *(b.T for _, _, b in kept)]
+            tables.append((np.concatenate(basis, 1), np.concatenate(weights)))
+        return Model(tables)
+
+    def _exact(self, k: int, part: slice, images: Images) -> list[np.ndarray]:
+        """Differences of level k to the exact coarser ones, [channel] (pairs, texels)."""
+        shapes = self.images.shapes
+        rests: list[tuple[int, np.ndarray]] = []
+        for j in range(len(shapes) - 1, k - 1, -1):
+            rest = images[j - k] - self.average[part, :, None]
+            for i, coarser in rests:
+                rest -= expanded(coarser, shapes[i], shapes[j], self.filter_type)
+            rests.append((j, rest))
+        return [np.ascontiguousarray(rests[-1][1][:, c]) for c in range(3)]
 
     def compress(self, k: int, counts: tuple[int, int, int] | None, target: float | None) -> list[int]:
         """Compress level k to the given numbers of components, or to as few as reach the target; returns them."""
-        shape = self.images[0][k].shape[:2]
-        flat = [image[k].reshape(shape[0] * shape[1], -1) for image in self.images]
-        energy = float((RGB_METRIC * _gram(flat)).sum())
+        energy, texels = self.energy[k], self.images.texels(k)
         # The mean takes a dimension: of n texels, n − 1 differences to it are independent.
-        limit = shape[0] * shape[1] - (k == len(self.images[0]) - 1)
-        rests = [f - self._predicted(c, shape, exact=not self.closed) for c, f in enumerate(flat)]
-        wanted = counts or (LARGEST,) * 3
-        ranges = [self._range(r, min(limit, n)) for r, n in zip(rests, wanted, strict=True)]
+        limit = texels - (k == len(self.images.shapes) - 1)
+        ranks = [min(limit, n) for n in counts or (LARGEST,) * 3]
+        ranges, amounts = self._ranges(k, ranks)
         own = [len(basis) for basis, _ in ranges]
         aimed = allowed = np.inf if target is None else target**2 * energy
+        coarser = [list(kept) for kept in self.kept]
         while True:
             if target is not None:
-                own = _fewest(rests, [coordinate for _, coordinate in ranges], aimed, k)
+                own = _fewest(amounts, [coordinate for _, coordinate in ranges], aimed, k)
             parts = [self._stored(k, *part, n) for part, n in zip(ranges, own, strict=True)]
-            left = [r - _product(part) for r, part in zip(rests, parts, strict=True)]
-            error = float((RGB_METRIC * _gram(left)).sum())
+            self.kept = [list(kept) for kept in coarser]
+            self._keep(k, parts)
+            gram = self._left(k)
+            error = float((RGB_METRIC * gram).sum())
             if target is None or error <= allowed or aimed == 0:
                 break
             # Channels' errors are correlated and stored maps are rounded: aim lower.
             aimed = 0.9 * aimed if aimed > 1e-6 * allowed else 0.0
-        self._keep(k, shape, rests, parts)
-        if not self.closed:
-            left = [f - self._predicted(c, shape, exact=False) for c, f in enumerate(flat)]
-            error = float((RGB_METRIC * _gram(left)).sum())
-        self.gram = _gram(left) / left[0].size
+        self.gram = gram / (texels * self.images.n_pairs)
         self.level_errors[k] = np.sqrt(error / energy) if energy > 0 else 0.0
         return [int(n) for n in own]
 
-    def _range(self, rest: np.ndarray, rank: int) -> tuple[np.ndarray, np.ndarray]:
-        if rank == 0:
-            return np.zeros((0, rest.shape[1]), np.float32), np.zeros((len(rest), 0), np.float32)
-        return range_basis(rest, rank, self.rng, iterations=2)
+    def _ranges(self, k: int, ranks: list[int]) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
+        """Leading directions of the differences of level k, [channel], and the differences' squares by channel."""
+        n, d = self.images.texels(k), self.images.n_pairs
+        bases = [
+            self.rng.standard_normal((n, min(r + OVERSAMPLING, n, d) if r else 0), np.float32) for r in ranks
+        ]
+        model, squares = self._model(k), np.zeros(3)
+        for turn in range(PASSES):
+            steps = [GramPass(basis, d) for basis in bases]
+            for part, images in self.images.blocks(k):
+                rests = model.rests(part, images[0]) if self.closed else self._exact(k, part, images)
+                for step, rest in zip(steps, rests, strict=True):
+                    if step.basis.shape[1]:
+                        step.add(part, rest)
+                if turn == 0:
+                    squares += np.array([np.einsum("ij,ij->i", r, r).sum(dtype=float) for r in rests])
+            if turn < PASSES - 1:
+                bases = [step.next_basis() if step.basis.shape[1] else step.basis for step in steps]
+        none = np.zeros((0, d), np.float32), np.zeros((n, 0), np.float32)
+        return [step.leading(r) if r else none for step, r in zip(steps, ranks, strict=True)], squares
+
+    def _left(self, k: int) -> np.ndarray:
+        """Inner products of what the stored levels leave of level k, by channel."""
+        model, gram = self._model(k), np.zeros((3, 3))
+        for part, images in self.images.blocks(k):
+            gram += _gram(model.rests(part, images[0]))
+        return gram
 
     def _stored(self, k: int, basis: np.ndarray, coordinate: np.ndarray, n: int) -> StoredChannel:
         """Weights and basis of the first components as they are stored."""
@@ -312,20 +355,17 @@ class _Levels:
         weights = stored(f"weights_{k}", coordinate[:, :n] * peak, self.storage)
         return weights, stored(f"basis_{k}", shapes, self.storage)
 
-    def _keep(
-        self, k: int, shape: tuple[int, ...], rests: list[np.ndarray], parts: list[StoredChannel]
-    ) -> None:
+    def _keep(self, k: int, parts: list[StoredChannel]) -> None:
         for channel, (weights, basis) in enumerate(parts):
             if len(basis):
-                wide = weights.astype(np.float32).reshape(*shape, -1), basis.astype(np.float32)
-                self.kept[channel].append(wide)
-            if not self.closed:
-                self.exact[channel].append(rests[channel].reshape(*shape, -1))
+                wide = np.ascontiguousarray(weights.T, np.float32), basis.astype(np.float32)
+                self.kept[channel].append((k, *wide))
         basis = np.concatenate([basis for _, basis in parts])
         if len(basis):
             table = np.ascontiguousarray(basis.T).reshape(self.n_views, -1, len(basis))
             self.maps[f"basis_{k}"] = table
-            self.maps[f"weights_{k}"] = np.concatenate([w for w, _ in parts], 1).reshape(*shape, -1)
+            weights = np.concatenate([w for w, _ in parts], 1)
+            self.maps[f"weights_{k}"] = weights.reshape(*self.images.shapes[k], -1)
 
     def errors(self) -> Facts:
         """JSON-able errors of the finest level and of all."""
@@ -336,9 +376,18 @@ class _Levels:
         }
 
 
-def _product(part: StoredChannel) -> np.ndarray:
-    weights, basis = (a.astype(np.float32) for a in part)
-    return product(weights, basis)
+@dataclass(frozen=True)
+class Model:
+    """Images as tables of pairs times weights of texels, [channel] ((pairs, m), (m, texels)), float32."""
+
+    tables: list[tuple[np.ndarray, np.ndarray]]
+
+    def rests(self, part: slice, images: np.ndarray) -> list[np.ndarray]:
+        """Differences of images (pairs, channel, texels) to the model, [channel] (pairs, texels)."""
+        return [
+            images[:, channel] - product(basis[part], weights, rows=ROWS)
+            for channel, (basis, weights) in enumerate(self.tables)
+        ]
 
 
 def _gram(arrays: Sequence[np.ndarray]) -> np.ndarray:
@@ -346,12 +395,12 @@ def _gram(arrays: Sequence[np.ndarray]) -> np.ndarray:
     return np.array([[np.einsum("ij,ij->i", a, b).sum(dtype=float) for b in arrays] for a in arrays])
 
 
-def _fewest(rests: list[np.ndarray], coordinates: list[np.ndarray], allowed: float, level: int) -> list[int]:
+def _fewest(squares: np.ndarray, coordinates: list[np.ndarray], allowed: float, level: int) -> list[int]:
     """Numbers of components by channel that leave at most ``allowed`` of weighted squared error, greedily."""
     gains = [
         np.einsum("nk,nk->k", c, c, dtype=float) * w for c, w in zip(coordinates, RGB_WEIGHT, strict=True)
     ]
-    left = float(np.diag(_gram(rests)) @ RGB_WEIGHT)
+    left = float(squares @ RGB_WEIGHT)
     own = [0, 0, 0]
     while left > allowed:
         following = [g[n] if n < len(g) else -1.0 for g, n in zip(gains, own, strict=True)]

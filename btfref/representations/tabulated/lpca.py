@@ -8,15 +8,17 @@ VMV 2003; the same authors, "Fast Environmental Lighting for Local-PCA Encoded B
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from btfref import conventions
 from btfref.numerics.solvers.clustering import leading_axes, local_pca
-from btfref.numerics.solvers.lowrank import range_basis, refined_basis, texel_matrix
-from btfref.numerics.solvers.threads import one_blas_thread, reproducible
+from btfref.numerics.solvers.streaming import leading, orthonormal, principal
+from btfref.numerics.solvers.threads import in_parallel, reproducible
 from btfref.precision import real
+from btfref.representations.columns import Steps, TexelColumns
 from btfref.representations.file.resident import refuse_absent
 from btfref.representations.file.schema import INDICES, MapSchema, Number, Schema
 from btfref.representations.guide import feature_views, group_means, texel_groups
@@ -34,17 +36,14 @@ from btfref.representations.lookup import (
 from btfref.representations.protocol import Entries, FitMemory
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Callable, Collection
 
     from numpy.typing import ArrayLike
 
     from btfref.representations.lookup import Stencils
-    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Facts, Progress
 
-
-#: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(7.6, tables=("clusters", "components"))
 
 #: "paper": the setting of the 2004 paper's timings, 16 clusters with a mean and 4 components, in floats.
 PRESETS = {"paper": {"clusters": 16, "components": 4, "storage": "float"}}
@@ -55,6 +54,12 @@ SUBSPACE_RANK = 64
 
 #: Additional axes that take part in the step of subspace iteration, so that the kept ones converge.
 OVERSAMPLING = 4
+
+#: How often the values are read for that subspace; the clusters' bases take two passes more.
+PASSES = 2
+
+#: See :mod:`btfref.representations.fit_memory`.
+FIT_MEMORY = FitMemory(view=14, columns=SUBSPACE_RANK + 24, tables=("clusters", "components"))
 
 
 class Representation(StoredMaps):
@@ -153,7 +158,7 @@ class Representation(StoredMaps):
 
 @reproducible()
 def fit(
-    btf: SampledBTF,
+    btf: BTFBlocks,
     *,
     seed: int = 0,
     progress: Progress | None = None,
@@ -169,7 +174,7 @@ def fit(
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
     seed : int
         Same seed, same result.
     progress : callable, optional
@@ -193,21 +198,18 @@ def fit(
         For parameters out of range, or values that do not fit ``storage``.
     """
     clusters, components = positive_integer("clusters", clusters), positive_integer("components", components)
-    report = progress or (lambda *_: None)
     rng = np.random.default_rng(seed)
-    rows, columns = btf.values.shape[2:4]
-    matrix = texel_matrix(btf.values)
-    report(0, 3, "global PCA")
-    subspace, coordinates = range_basis(matrix, max(SUBSPACE_RANK, 2 * components), rng)
-    coordinates = coordinates.astype(float)
-    squares = np.einsum("ij,ij->i", matrix, matrix).astype(float)
+    rows, columns = btf.texels
+    steps = Steps(progress, (PASSES + 2) * len(btf.views))
+    steps.begin("global PCA")
+    found = leading(TexelColumns(btf, steps), max(SUBSPACE_RANK, 2 * components), rng, passes=PASSES)
+    coordinates, squares = found.coordinates.astype(float), found.squares
     energy = float(squares.sum())
-    report(1, 3, "clustering")
+    steps.begin("clustering")
     labels, iterations = local_pca(coordinates, clusters, components, rng)
-    report(2, 3, "cluster bases")
-    means, axes, weights, error = _cluster_bases(
-        matrix, squares, subspace, coordinates, labels, clusters, components
-    )
+    steps.begin("cluster bases")
+    bases = ClusterBases(coordinates, labels, clusters, components)
+    means, axes, weights, error = bases.of(btf, squares, steps)
     axes, peak = unit_peaks(axes)
     weights = weights * peak[labels]
     table = np.concatenate([means[:, None], axes], 1)
@@ -230,38 +232,79 @@ def fit(
     return Representation(maps | direction_arrays(btf.views, btf.lights), meta)
 
 
-def _cluster_bases(
-    matrix: np.ndarray,
-    squares: np.ndarray,
-    subspace: np.ndarray,
-    coordinates: np.ndarray,
-    labels: np.ndarray,
-    clusters: int,
-    components: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Mean, axes and weights of each cluster from full vectors, and the squared error left.
+class ClusterBases:
+    """Mean, axes and weights of each cluster from full vectors, in two passes over the data.
 
-    The clusters' axes within the subspace are the start of one step of subspace iteration on the full vectors.
+    The clusters' axes within the subspace are the start of one step of subspace iteration on the full vectors: one pass
+    multiplies the members by their weights along them, the other one by what that spans.
+
+    Parameters
+    ----------
+    coordinates : ndarray of float64, shape (n, r)
+        Of the texels in the subspace.
+    labels : ndarray of int, shape (n,)
+    clusters, components : int
     """
-    n, d = matrix.shape
-    means, axes = np.zeros((clusters, d), np.float32), np.zeros((clusters, components, d), np.float32)
-    weights = np.zeros((n, components), np.float32)
-    error = 0.0
-    groups = [np.flatnonzero(labels == k) for k in range(clusters)]
-    with one_blas_thread():
-        starts = {
-            k: leading_axes(coordinates[members], components + OVERSAMPLING)
-            for k, members in enumerate(groups)
-            if len(members)
-        }
-    for k, start in starts.items():
-        members = groups[k]
-        block = matrix[members]
-        means[k] = block.mean(0)
-        block -= means[k]
-        basis, weight = refined_basis(block, start.astype(np.float32) @ subspace)
-        rank = min(components, len(basis))
-        axes[k, :rank], weights[members, :rank] = basis[:rank], weight[:, :rank]
-        error += squares[members].sum() - len(members) * float(means[k].astype(float) @ means[k])
-        error -= float((weights[members].astype(float) ** 2).sum())
-    return means, axes, weights, max(error, 0.0)
+
+    def __init__(self, coordinates: np.ndarray, labels: np.ndarray, clusters: int, components: int) -> None:
+        self.clusters, self.components = clusters, components
+        #: Texels cluster after cluster, and each one's part of them.
+        self.order = np.argsort(labels, kind="stable")
+        ends = np.cumsum(np.bincount(labels, minlength=clusters)).tolist()
+        self.parts = [slice(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
+        self.used = [k for k, part in enumerate(self.parts) if part.stop > part.start]
+        self.starts: dict[int, np.ndarray] = {}
+        for k in self.used:
+            own = coordinates[self.order[self.parts[k]]]
+            start = leading_axes(own, components + OVERSAMPLING)
+            weights = (own - own.mean(0)) @ start.T
+            self.starts[k] = orthonormal(weights)[:, : len(own)].astype(np.float32)
+
+    def of(
+        self, btf: BTFBlocks, squares: np.ndarray, tick: Callable[[], object]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+        """Means (cluster, d), axes (cluster, component, d), weights (n, component), and the squared error left.
+
+        Parameters
+        ----------
+        btf : BTFBlocks
+        squares : ndarray, shape (n,)
+            Squared lengths of the texels' vectors.
+        tick : callable
+            Called after each view of a pass.
+        """
+        matrix = TexelColumns(btf, tick, self.order)
+        n, d = matrix.shape
+        means = np.zeros((self.clusters, d), np.float32)
+        samples = {k: np.zeros((d, start.shape[1]), np.float32) for k, start in self.starts.items()}
+
+        def sample(columns: slice, block: np.ndarray, k: int) -> None:
+            members = block[:, self.parts[k]]
+            means[k, columns] = members.mean(1)
+            members -= means[k, columns, None]
+            samples[k][columns] = members @ self.starts[k]
+
+        for columns, block in matrix.blocks():
+            in_parallel(partial(sample, columns, block), self.used)
+        spans = {k: orthonormal(found) for k, found in samples.items()}
+        projected = {k: np.zeros((self.parts[k].stop - self.parts[k].start, span.shape[1]))
+                     for k, span in spans.items()}  # fmt: skip
+
+        def project(columns: slice, block: np.ndarray, k: int) -> None:
+            members = block[:, self.parts[k]]
+            members -= means[k, columns, None]
+            projected[k] += members.T @ spans[k][columns]
+
+        for columns, block in matrix.blocks():
+            in_parallel(partial(project, columns, block), self.used)
+        axes = np.zeros((self.clusters, self.components, d), np.float32)
+        weights = np.zeros((n, self.components), np.float32)
+        error = 0.0
+        for k in self.used:
+            basis, weight = principal(spans[k], projected[k])
+            rank = min(self.components, len(basis))
+            members = self.order[self.parts[k]]
+            axes[k, :rank], weights[members, :rank] = basis[:rank], weight[:, :rank]
+            error += squares[members].sum() - len(members) * float(means[k].astype(float) @ means[k])
+            error -= float((weights[members].astype(float) ** 2).sum())
+        return means, axes, weights, max(error, 0.0)

@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from btfref.representations.lookup import Stencils
-    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.blocks import BTFBlocks
     from btfref.sampling.store.store import BTFStore
     from btfref.types import Facts, Progress
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(6.6)
+FIT_MEMORY = FitMemory(4.6, rows=3, texels=1)
 
 PRESETS: dict[str, Facts] = {"paper": {}}
 
@@ -84,13 +84,13 @@ class Representation(StoredMaps):
 
 
 def fit(
-    btf: SampledBTF, *, seed: int = 0, progress: Progress | None = None, filter_type: str = "bilinear"
+    btf: BTFBlocks, *, seed: int = 0, progress: Progress | None = None, filter_type: str = "bilinear"
 ) -> Representation:
     """The table of ``btf`` in the layout of lookups.
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
     seed : int
         Unused: nothing is random.
     progress : callable, optional
@@ -103,9 +103,11 @@ def fit(
     InputError
         For values that are not finite.
     """
-    for view in btf.values:
-        refuse_not_finite(view, btf)
-    values = np.ascontiguousarray(np.transpose(btf.values, (2, 3, 0, 1, 4)))
+    values = np.zeros((*btf.texels, len(btf.views), len(btf.lights), 3), btf.dtype)
+    for row, place in enumerate(values):
+        found = btf.rows(row, row + 1)[:, :, 0]
+        refuse_not_finite(found, btf)
+        place[:] = np.moveaxis(found, 2, 0)
     meta = base_meta("raw", btf, {}, filter_type=filter_type)
     return Representation({"values": values, **direction_arrays(btf.views, btf.lights)}, meta)
 

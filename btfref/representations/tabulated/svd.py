@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from btfref import conventions
-from btfref.numerics.solvers.lowrank import range_basis, texel_matrix
+from btfref.numerics.solvers.streaming import leading
 from btfref.numerics.solvers.threads import reproducible
 from btfref.precision import real
+from btfref.representations.columns import Steps, TexelColumns
 from btfref.representations.file.schema import MapSchema, Number, Schema
 from btfref.representations.guide import feature_views, group_means, texel_groups
 from btfref.representations.lookup import (
@@ -35,15 +36,18 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from btfref.representations.lookup import Stencils
-    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Facts, Progress
 
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(6.8, tables=("components",))
+FIT_MEMORY = FitMemory(view=12, columns=24, tables=("components",))
 
 #: Koudelka et al. keep 150 components for one texture; 16 cost a lookup about three times what local PCA's 4 cost.
 PRESETS = {"paper": {"components": 150, "storage": "float"}}
+
+#: How often the values are read: two power iterations and the last projection.
+PASSES = 3
 
 
 class Representation(StoredMaps):
@@ -96,7 +100,7 @@ class Representation(StoredMaps):
 
 @reproducible()
 def fit(
-    btf: SampledBTF,
+    btf: BTFBlocks,
     *,
     seed: int = 0,
     progress: Progress | None = None,
@@ -108,7 +112,7 @@ def fit(
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
     seed : int
         Of the randomized subspace iteration; same seed, same result.
     progress : callable, optional
@@ -131,12 +135,11 @@ def fit(
         For parameters out of range, or values that do not fit ``storage``.
     """
     components = positive_integer("components", components)
-    report = progress or (lambda *_: None)
-    rows, columns = btf.values.shape[2:4]
-    matrix = texel_matrix(btf.values)
-    report(1, 2, "singular vectors")
-    basis, weights = range_basis(matrix, components, np.random.default_rng(seed), iterations=2)
-    energy = float(np.einsum("ij,ij->", matrix, matrix, dtype=np.float64))
+    rows, columns = btf.texels
+    steps = Steps(progress, PASSES * len(btf.views))
+    steps.begin("singular vectors")
+    found = leading(TexelColumns(btf, steps), components, np.random.default_rng(seed), passes=PASSES)
+    basis, weights, energy = found.basis, found.coordinates, float(found.squares.sum())
     kept = float((weights.astype(float) ** 2).sum())
     shapes, peak = unit_peaks(basis)
     table = shapes.reshape(-1, len(btf.views), len(btf.lights), 3)
@@ -148,5 +151,4 @@ def fit(
     meta = base_meta("svd", btf, parameters, filter_type=filter_type)
     meta["constants"] = {"n_components": len(basis)}
     meta["fit"] = {"error": max(0.0, 1 - kept / energy) if energy > 0 else 0.0}
-    report(2, 2, "maps")
     return Representation(maps | direction_arrays(btf.views, btf.lights), meta)

@@ -12,8 +12,9 @@ import os
 import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -236,39 +237,64 @@ class Shards:
         where = index.reshape(-1).view(np.uint8)
         write_bytes(path, data, where, checksum(where))
 
-    def read(self, view: int, values: np.ndarray) -> None:
-        """Read a whole view into an array (lights, rows, columns, 3).
+    def read(self, view: int, values: np.ndarray, first: int = 0) -> None:
+        """Read rows of a view into an array (lights, rows, columns, 3); files and chunks of other rows are not touched.
+
+        Parameters
+        ----------
+        view : int
+        values : ndarray
+            All lights and columns.
+        first : int
+            Row of the view that ``values`` begin with.
 
         Raises
         ------
         ValueError
             A file that is missing, incomplete or damaged.
         """
-        sides = [k * t for k, t in zip(self.grid, (1, *self.tile), strict=True)]
-        for shard in np.ndindex(*(-(-n // side) for n, side in zip(values.shape, sides, strict=False))):
-            first = [k * side for k, side in zip(shard, sides, strict=True)]
-            part = values[tuple(slice(a, a + side) for a, side in zip(first, sides, strict=True))]
-            path = self.path(view, (shard[0], shard[1], shard[2]))
-            try:
-                data = np.fromfile(path, np.uint8)
-            except FileNotFoundError:
-                raise ValueError(f"no file {path.relative_to(self.folder)}") from None
-            index = self.index(data, path).reshape(*self.grid, 2)
-            for light, row, column in np.ndindex(len(part), *(-(-n // t) for n, t in zip(
-                    part.shape[1:3], self.tile, strict=True))):  # fmt: skip
-                start, size = index[light, row, column].tolist()
-                if start == _ABSENT:
-                    raise ValueError(f"a chunk of {path.relative_to(self.folder)} is missing")
-                chunk = data[start : start + size - _SUM]
-                if checksum(chunk) != data[start + size - _SUM : start + size].tobytes():
-                    raise ValueError(f"checksum of a chunk of {path.relative_to(self.folder)}")
-                place = part[
-                    light,
-                    row * self.tile[0] : (row + 1) * self.tile[0],
-                    column * self.tile[1] : (column + 1) * self.tile[1],
-                ]
-                tile = chunk.view(self.dtype).reshape(*self.tile, 3)
-                place[...] = tile[: place.shape[0], : place.shape[1]]
+        lights, rows, columns = (k * t for k, t in zip(self.grid, (1, *self.tile), strict=True))
+        last = first + values.shape[1]
+        for light in range(-(-values.shape[0] // lights)):
+            for row in range(first // rows, -(-last // rows)):
+                for column in range(-(-values.shape[2] // columns)):
+                    start, end = max(first, row * rows), min(last, (row + 1) * rows)
+                    part = values[
+                        light * lights : (light + 1) * lights,
+                        start - first : end - first,
+                        column * columns : (column + 1) * columns,
+                    ]
+                    self._read_shard(self.path(view, (light, row, column)), part, start - row * rows)
+
+    def _read_shard(self, path: Path, part: np.ndarray, first: int) -> None:
+        """Rows of a shard from ``first`` on, into an array that ends where the view does."""
+        tile_rows, tile_columns = self.tile
+        last = first + part.shape[1]
+        tiles = range(first // tile_rows, -(-last // tile_rows))
+        # All of a file in one go, or, of a few rows, no more than their chunks.
+        mode: Literal["r"] = "r"
+        try:
+            data = (
+                np.fromfile(path, np.uint8)
+                if len(tiles) == self.grid[1]
+                else np.memmap(path, np.uint8, mode).view(np.ndarray)
+            )
+        except FileNotFoundError:
+            raise ValueError(f"no file {path.relative_to(self.folder)}") from None
+        index = self.index(data, path).reshape(*self.grid, 2)
+        for light, row, column in product(range(len(part)), tiles, range(-(-part.shape[2] // tile_columns))):
+            start, size = index[light, row, column].tolist()
+            if start == _ABSENT:
+                raise ValueError(f"a chunk of {path.relative_to(self.folder)} is missing")
+            chunk = data[start : start + size - _SUM]
+            if checksum(chunk) != data[start + size - _SUM : start + size].tobytes():
+                raise ValueError(f"checksum of a chunk of {path.relative_to(self.folder)}")
+            begin, end = max(first, row * tile_rows), min(last, (row + 1) * tile_rows)
+            place = part[
+                light, begin - first : end - first, column * tile_columns : (column + 1) * tile_columns
+            ]
+            tile = chunk.view(self.dtype).reshape(*self.tile, 3)
+            place[...] = tile[begin - row * tile_rows : end - row * tile_rows, : place.shape[1]]
 
     def _chunks(self, path: Path) -> dict[int, np.ndarray]:
         """Chunks of a file, with their checksums, by their numbers."""

@@ -417,7 +417,9 @@ class BTFStore:
         selection = [along_axis(name, index, n) for name, index, n in axes]
         indices = [np.arange(n)[chosen] for chosen, n in zip(selection, lengths, strict=True)]
         tiles = [np.unique(index // size) for index, size in zip(indices[2:], self.tile, strict=True)]
-        covered = self.coverage[np.ix_(indices[0], indices[1], *tiles)]
+        # Marks of these views alone: who goes through all views reads each one's once.
+        there = np.stack([self.covered(view) for view in indices[0].tolist()])
+        covered = there[np.ix_(np.arange(len(there)), indices[1], *tiles)]
         if not covered.all():
             raise InputError(
                 "part that is not there yet (interrupted run?)",
@@ -431,15 +433,19 @@ class BTFStore:
         return values, None if wanted is None else self._read("variance", wanted, selection)
 
     def _read(self, field: str, array: StoredArray, selection: Sequence[slice | np.ndarray]) -> np.ndarray:
-        texels = zip(selection[1:], array.shape[1:], strict=False)
-        whole = all(isinstance(part, slice) and part.indices(n) == (0, n, 1) for part, n in texels)
+        sides = zip(selection[1:4:2], array.shape[1:4:2], strict=True)
+        whole = all(isinstance(part, slice) and part.indices(n) == (0, n, 1) for part, n in sides)
+        rows = np.arange(array.shape[2])[selection[2]]
+        together = len(rows) > 0 and (np.diff(rows) == 1).all()
         selection = (*selection, slice(None))
-        if self._local and whole:
-            # Whole files at once: Zarr spends a call or more on each chunk.
+        if self._local and whole and together:
+            # Whole files at once, or the chunks of some rows: Zarr spends a call or more on each chunk.
             views = np.arange(len(self.views))[selection[0]]
-            values = np.zeros((len(views), *array.shape[1:]), self._shards[field].dtype)
+            values = np.zeros(
+                (len(views), array.shape[1], len(rows), *array.shape[3:]), self._shards[field].dtype
+            )
             for place, view in zip(values, views.tolist(), strict=True):
-                self._guard(field, partial(self._shards[field].read, view, place))
+                self._guard(field, partial(self._shards[field].read, view, place, int(rows[0])))
         elif all(isinstance(part, slice) for part in selection):
             values = self._guard(field, lambda: array[selection])
         else:

@@ -258,6 +258,19 @@ def test_dfmf_error_is_what_it_says(model, sampled, tmp_path):
     assert facts["components"] == [3, 3, 3]
 
 
+def test_a_tile_is_repeated(sampled, tmp_path):
+    """A file larger than the BTF, which is what it says: the error against the repeated tile is the stated one."""
+    facts = export_btf(sampled, tmp_path / "x.btf", "bonn", components=3, scalar=4, texels=13)
+    back = SampledBTF.load(import_btf(tmp_path / "x.btf", tmp_path / "x.btf.zarr", dtype="float32").path)
+    rows, columns = (np.arange(13) % n for n in sampled.texels)
+    original = sampled.values[:, :, rows[:, None], columns].astype(float)
+    error = np.sqrt(((back.values - original) ** 2).sum((0, 1, 2, 3)) / (original**2).sum((0, 1, 2, 3)))
+    np.testing.assert_allclose(error, facts["error"], rtol=tolerance("formats.stated.rtol"))
+    export_btf(sampled, tmp_path / "y.btf", "bonn", family="BDI", texels=13)
+    back = SampledBTF.load(import_btf(tmp_path / "y.btf", tmp_path / "y.btf.zarr").path)
+    assert np.array_equal(back.values, original.astype(np.float16))
+
+
 def test_dfmf_for_a_target_error(sampled, tmp_path):
     wanted = 0.05
     facts = export_btf(sampled, tmp_path / "x.btf", "bonn", error=wanted, scalar=4)
@@ -273,6 +286,7 @@ def test_dfmf_for_a_target_error(sampled, tmp_path):
         ({"colour_model": 3}, "colour_model"),
         ({"scalar": 8}, "scalar"),
         ({"components": 0}, "components"),
+        ({"texels": 0}, "texels"),
         ({"error": 2}, "error"),
         ({"error": 0.1, "components": 2}, "components"),
         ({"nonsense": 1}, "nonsense"),

@@ -12,7 +12,8 @@ from btfref.conventions import texel_stencil
 from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
 from btfref.numerics.solvers.clustering import local_pca
-from btfref.numerics.solvers.lowrank import range_basis, refined_basis, texel_matrix
+from btfref.numerics.solvers.lowrank import range_basis, texel_matrix
+from btfref.numerics.solvers.streaming import array_columns, leading, orthonormal, principal
 from btfref.registry import method, methods
 from btfref.representations import load, read_info, save
 from btfref.representations.file.container import payload_bytes
@@ -194,9 +195,28 @@ def test_range_basis_spans_the_leading_space(rng):
     )
 
 
-def test_refined_basis_has_no_more_than_the_rank(rng):
-    rows = (rng.normal(size=(9, 2)) @ rng.normal(size=(2, 40))).astype(np.float32)
-    basis, coordinates = refined_basis(rows, np.linalg.qr(rng.normal(size=(40, 5)))[0].T.astype(np.float32))
+def test_leading_directions_are_found_by_blocks(rng):
+    """From blocks of columns, what the whole matrix has; nothing beyond its rank."""
+    left, right = np.linalg.qr(rng.normal(size=(80, 30)))[0], np.linalg.qr(rng.normal(size=(200, 30)))[0]
+    values = 0.5 ** np.arange(30)
+    matrix = ((left * values) @ right.T).astype(np.float32)
+    found = leading(array_columns(matrix, 23), 6, rng, passes=3)
+    np.testing.assert_allclose(found.coordinates, matrix @ found.basis.T, atol=tolerance("lowrank.basis.max"))
+    np.testing.assert_allclose(
+        np.abs(np.einsum("ij,ij->i", found.basis, right.T[:6])), 1, atol=tolerance("lowrank.basis.max")
+    )
+    np.testing.assert_allclose(found.squares, (matrix**2).sum(1), atol=tolerance("lowrank.basis.max"))
+    flat = leading(array_columns(np.outer(left[:, 0], right[:, 0]), 50), 4, rng, passes=2)
+    np.testing.assert_array_equal(flat.coordinates[:, 1:], 0)
+    np.testing.assert_allclose(
+        np.abs(flat.coordinates[:, 0]), np.abs(left[:, 0]), atol=tolerance("lowrank.basis.max")
+    )
+
+
+def test_principal_directions_have_no_more_than_the_rank(rng):
+    rows = rng.normal(size=(9, 2)) @ rng.normal(size=(2, 40))
+    span = orthonormal(np.concatenate([rows[:3].T, rng.normal(size=(40, 2))], 1))
+    basis, coordinates = principal(span, rows @ span)
     np.testing.assert_array_equal(basis[2:], 0)
     np.testing.assert_allclose(basis[:2] @ basis[:2].T, np.eye(2), atol=tolerance("lowrank.basis.max"))
     np.testing.assert_allclose(
