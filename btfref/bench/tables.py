@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from btfref.bench.metrics import latest, read_records, rows
+from btfref.querying import off_grid
 from btfref.report.pareto import Panel, Point, front
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ REPEATED = 1e-6
 
 #: Kinds of records in the order of tables: title and columns.
 KINDS = {
+    "off_grid": "Error at directions that nobody fitted (99 % interval)",
     "build": "Fits",
     "error": "Error at measured entries (99 % interval)",
     "eval": "Evaluations",
@@ -142,8 +144,8 @@ def compared(a: PathLike, b: PathLike) -> list[Facts]:
         if second is None:
             continue
         what = " · ".join(str(k) for k in key if k)
-        if first["kind"] == "error":
-            x, y = first["rmse"], second["rmse"]
+        if first["kind"] in ("error", "off_grid"):
+            x, y = (r["rmse"] if r["kind"] == "error" else r["nrmse"][0] for r in (first, second))
             line = {"what": what + " · RMSE", "first": x, "second": y, "ratio": y / x if x else None}
             result.append(line | {"low": None, "high": None})
         elif "time" in first:
@@ -213,6 +215,14 @@ _NAME = {
 _QUERY = {**_NAME, "query": lambda r: r["query"]}
 
 _COLUMNS = {
+    "off_grid": {
+        **_NAME,
+        "footprint": lambda r: r["query"],
+        **{
+            head: lambda r, number=number: off_grid.cells(r)[number]
+            for number, head in enumerate(off_grid.HEADS)
+        },
+    },
     "build": {
         **_NAME,
         "seconds": lambda r: _span(r["time"]),

@@ -19,6 +19,7 @@ from btfref.conventions import PixelClass
 from btfref.errors import InputError
 from btfref.gates import tolerance, tolerances
 from btfref.images.display import Display
+from btfref.querying import off_grid
 from btfref.registry import methods
 from btfref.report.pack import pack, unpack, unpack_text
 from btfref.report.validation import write_validation
@@ -30,7 +31,7 @@ from btfref.validate.matrix import FULL, LIGHTS, MESOSTRUCTURES, QUICK, SCENES, 
 from btfref.validate.run import Validation
 from btfref.validate.stages import drawn
 from btfref.validate.stages.fits import fit_key
-from btfref.validate.summary import HEADER, rows
+from btfref.validate.summary import HEADER, off_grid_rows, rows
 
 
 def test_selection():
@@ -220,14 +221,14 @@ def result(rng):
         measured = (*made.comparison().gates, *fall.gates)
         facts["gates"] = [g.to_dict() for g in measured]
         cells.append(replace(made, measured=measured))
-    held = {"seen": {"rmse": 0.1, "mae": 0.1}, "held_out": {"rmse": 0.3, "mae": 0.2}}
-    held |= {"views": [41, 40], "lights": [41, 40]}
+    errors = {name: [0.2, 0.1, 0.3] for name in ("rmse", "nrmse", "mae", "psnr_log", "bias")}
+    errors |= {"delta_e00": [8.5, 8.0, 9.0], "noise": 0.01, "rows": 500}
     of_methods = [
         {
             "mesostructure": "checker",
             "method": key,
             "gates": cells[0].facts["gates"][:1],
-            "held_out": held,
+            "off_grid": {footprint: errors for footprint in off_grid.FOOTPRINTS},
             "bytes": n,
         }
         for key, n in (("lpca", 3000), ("svd", 1000))
@@ -280,7 +281,15 @@ def test_summary_has_a_row_a_method(result):
     ]
     fall = result.cells[0].facts["waterfall"]
     assert table[0]["total"] == pytest.approx(fall["total"]["estimate"] / fall["mean"])
-    assert table[0]["held out"] == 0.2
+    assert table[0]["off grid ΔE00"] == 8.5
+    assert table[0]["off grid MAE"] == 0.2
+    header, lines = off_grid_rows(result)
+    assert [line[:3] for line in lines[:3]] == [["checker", "lpca", name] for name in off_grid.FOOTPRINTS]
+    assert dict(zip(header, lines[0], strict=True))["ΔE00"] == "8.50 (8.00 to 9.00)"
+    # Where the checks failed there is no error to show.
+    none = replace(result, methods=[{**facts, "off_grid": None} for facts in result.methods])
+    assert rows(none)[0][2] is None
+    assert off_grid_rows(none)[1] == []
 
 
 DRIVER = """<script>
@@ -349,6 +358,7 @@ def test_the_report_works_from_disk(result, tmp_path, need, width):
     assert len(cells) == 2
     text += "".join(cells)
     assert "Where the error comes from" in text
+    assert "8.50 (8.00 to 9.00)" in text
     assert not re.search(r'(src|href)="https?:', text)
 
 
@@ -407,3 +417,6 @@ def test_hostile_names_cannot_break_the_pages(result, tmp_path):
 def test_settings_say_how_finely():
     assert FULL.texels > QUICK.texels
     assert FULL.size > QUICK.size
+    # The rows of benchmarks.
+    assert (FULL.off_grid_rows, FULL.off_grid_spp) == (off_grid.ROWS, off_grid.SPP)
+    assert (QUICK.off_grid_rows, QUICK.off_grid_spp) == (off_grid.QUICK_ROWS, off_grid.QUICK_SPP)
