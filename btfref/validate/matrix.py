@@ -29,6 +29,9 @@ LIGHTS = {
     **{name: {"lights": "envmap", "environment": name} for name in ENVIRONMENTS},
 }
 
+#: Those under which nothing is random.
+DELTA = tuple(name for name in LIGHTS if name not in ENVIRONMENTS)
+
 MESOSTRUCTURES = ("checker", "rings", "tissue")
 
 #: What the quick run shows of each method: every scene once, every kind of light.
@@ -84,6 +87,8 @@ class Settings:
         Paths per pixel and batch of the truth; there are four batches.
     environment_spp : int
         Samples per pixel of the path-traced sampled BTF under an environment, in four batches.
+    browser_lights : tuple of str
+        Delta lights under which the browser draws the pictures as well.
     port_pixels : int
         Pixels at which the approximation under an environment is evaluated in float64.
     off_grid_rows, off_grid_spp : int
@@ -104,6 +109,7 @@ class Settings:
     environment_grid: int = 2
     truth_spp: int = 128
     environment_spp: int = 1024
+    browser_lights: tuple[str, ...] = DELTA
     port_pixels: int = 64
     off_grid_rows: int = 20_000
     off_grid_spp: int = 64
@@ -131,6 +137,7 @@ QUICK = replace(
     size=48,
     environment_size=40,
     truth_spp=192,
+    browser_lights=("directional3",),
     off_grid_rows=500,
     off_grid_spp=32,
     chi2_samples=200_000,

@@ -22,6 +22,7 @@ from btfref.validate.cell import CellResult, failed_cell, gate_from, make_cell
 from btfref.validate.material import make_material
 from btfref.validate.matrix import FULL, Settings
 from btfref.validate.pictures import make_carrier, make_views
+from btfref.validate.stages.browser import demand_browser
 from btfref.validate.stages.checks import make_checks
 from btfref.validate.stages.drawn import code_of, found, recall
 from btfref.validate.stages.fits import make_fit
@@ -129,12 +130,15 @@ def validate(
     ------
     InputError
         No cells.
+    MissingDependencyError
+        Without Chromium where ``BTFREF_REQUIRE`` names it.
     BtfrefError
         When a process dies.
     """
     from btfref.provenance import versions
     from btfref.stress.evaluators import PORTS, present
 
+    demand_browser()
     specs = sorted(set(specs))
     if not specs:
         raise InputError("nothing to validate", field="cells", got=0)

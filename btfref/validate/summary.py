@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 #: Columns of stages in the table, by the names of the stages.
-STAGES = ("sampled BTF", "fit", "port", "real time", "8 bits")
+STAGES = ("sampled BTF", "fit", "port", "real time", "WebGL 2", "8 bits")
 
 #: Columns of errors at directions that nobody fitted, and their names in `btfref.querying.accuracy.accuracy`.
 OFF_GRID = {"off grid ΔE00": "delta_e00", "off grid MAE": "mae"}

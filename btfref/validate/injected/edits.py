@@ -32,6 +32,7 @@ SETTINGS = replace(
     spp=4,
     size=24,
     truth_spp=16,
+    browser_lights=(),
     off_grid_rows=60,
     off_grid_spp=8,
     chi2_samples=50_000,

@@ -16,7 +16,7 @@ from schemas import assert_follows_schema
 from btfref.commands.validate import lines
 from btfref.comparison.waterfall import Picture, waterfall
 from btfref.conventions import PixelClass
-from btfref.errors import InputError
+from btfref.errors import InputError, MissingDependencyError
 from btfref.gates import tolerance, tolerances
 from btfref.images.display import Display
 from btfref.querying import off_grid
@@ -28,8 +28,8 @@ from btfref.validate.cell import GATES, CellResult, eight_bits, failed_cell, rea
 from btfref.validate.cell import _save as save_cell
 from btfref.validate.material import material_key
 from btfref.validate.matrix import FULL, LIGHTS, MESOSTRUCTURES, QUICK, SCENES, Spec, select
-from btfref.validate.run import Validation
-from btfref.validate.stages import drawn
+from btfref.validate.run import Validation, validate
+from btfref.validate.stages import browser, drawn
 from btfref.validate.stages.fits import fit_key
 from btfref.validate.summary import HEADER, off_grid_rows, rows
 
@@ -150,6 +150,25 @@ def test_another_browser_makes_other_keys(tmp_path, monkeypatch):
         told.append(drawn.code_of("btfref.validate.cell"))
     assert len(set(told)) == 3
     assert drawn.driver().endswith("Chromium 157.0")
+
+
+def test_without_a_browser_its_pictures_are_left_out_or_demanded(monkeypatch):
+    lights = QUICK.browser_lights[0]
+    assert set(QUICK.browser_lights) < set(FULL.browser_lights)
+    monkeypatch.delenv("BTFREF_REQUIRE", raising=False)
+    monkeypatch.setattr(browser, "chromium", lambda: "chromium")
+    assert browser.draws(lights, QUICK)
+    assert not browser.draws("sky", FULL)
+    assert browser.left_out(lights, QUICK) == ""
+    monkeypatch.setattr(browser, "chromium", lambda: None)
+    assert not browser.draws(lights, QUICK)
+    assert "Chromium is not on this machine" in browser.left_out(lights, QUICK)
+    assert browser.left_out("sky", QUICK) == ""
+    browser.demand_browser()
+    for wanted in ("chromium", "gl, chromium", "all"):
+        monkeypatch.setenv("BTFREF_REQUIRE", wanted)
+        with pytest.raises(MissingDependencyError, match="Chromium"):
+            validate([Spec("checker", "lpca", "sphere", lights)])
 
 
 def test_evaluators_that_took_no_part_are_named(monkeypatch):
