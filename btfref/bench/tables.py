@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from btfref.bench.metrics import latest, read_records, rows
@@ -208,6 +208,11 @@ def _new_kernels(facts: Facts | None) -> str:
     return f"{found[0]} compiled, {found[1]} from disk: {facts['codegen_s'] + facts['backend_s']:.2g} s"
 
 
+def _off_grid(number: int) -> Callable[[Facts], str]:
+    """A column of errors off the grid."""
+    return lambda r: off_grid.cells(r)[number]
+
+
 _NAME = {
     "material": lambda r: r["material"],
     "entry": lambda r: r["entry"],
@@ -218,10 +223,7 @@ _COLUMNS = {
     "off_grid": {
         **_NAME,
         "footprint": lambda r: r["query"],
-        **{
-            head: lambda r, number=number: off_grid.cells(r)[number]
-            for number, head in enumerate(off_grid.HEADS)
-        },
+        **{head: _off_grid(number) for number, head in enumerate(off_grid.HEADS)},
     },
     "build": {
         **_NAME,

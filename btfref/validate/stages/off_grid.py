@@ -38,7 +38,8 @@ def make_truth(cache: Cache, mesostructure: str, settings: Settings) -> Path:
 
     def save(path: Path) -> None:
         rows = true_rows(mesostructure, settings.off_grid_rows, settings.off_grid_spp, settings.texels)
-        np.savez(path, **packed(rows))
+        arrays: Facts = packed(rows)
+        np.savez(path, **arrays)
 
     return cache.get(truth_key(mesostructure, settings), ".offgrid.npz", save)
 
