@@ -52,6 +52,9 @@ COLUMNS = {
     "delta_e00": ("ΔE00", "{:.2f}"),
 }
 
+#: PSNR beyond which an error is none: float32 resolves no more.
+MOST_DB = 160.0
+
 #: Heads of the columns.
 HEADS = tuple(head for head, _ in COLUMNS.values())
 
@@ -147,7 +150,10 @@ def cells(facts: Facts) -> list[str]:
     """Errors at a footprint as a table shows them: 99 % intervals in brackets."""
     found = []
     for name, (_, form) in COLUMNS.items():
-        middle, low, high = (form.format(float(value)) for value in facts[name])
+        middle, low, high = (
+            "∞" if name == "psnr_log" and float(value) > MOST_DB else form.format(float(value))
+            for value in facts[name]
+        )
         found.append(f"{middle} ({low} to {high})")
     return found
 

@@ -59,6 +59,7 @@ def test_what_is_right_has_no_error_and_what_is_double_has_all(truth):
     right, double = (off_grid.errors(Exact(truth, factor), truth) for factor in (1, 2))
     for footprint in off_grid.FOOTPRINTS:
         assert right[footprint]["nrmse"][2] <= tolerance("queries.rounding.length")
+        assert off_grid.cells(right[footprint])[2].startswith("∞")
         _, low, high = double[footprint]["nrmse"]
         assert low < 1 < high
         assert double[footprint]["delta_e00"][1] > 0
