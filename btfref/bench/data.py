@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from btfref.mesostructure.base import Mesostructure
     from btfref.sampling import SampledBTF
     from btfref.types import Progress
 
@@ -66,3 +67,29 @@ def material_name(btf: SampledBTF) -> str:
     if "mesostructure" in (parent.get("kind"), *btf.attributes):
         return str(parent.get("name", btf.attributes.get("mesostructure")))
     return Path(btf.path).name.removesuffix(".btf.zarr") if btf.path else "BTF"
+
+
+def source_of(btf: SampledBTF) -> Mesostructure | None:
+    """The geometry that a BTF was synthesized from.
+
+    Parameters
+    ----------
+    btf : SampledBTF
+
+    Returns
+    -------
+    Mesostructure or None
+        None for measured data, and for geometry that is not there any more, or not the same.
+    """
+    from btfref.errors import InputError
+    from btfref.mesostructure import build
+    from btfref.sampling.job import fingerprint
+
+    parent = btf.attributes.get("parent", {})
+    if parent.get("kind") != "mesostructure":
+        return None
+    try:
+        made = build(parent["name"], **parent["parameters"])
+    except (InputError, TypeError, KeyError):
+        return None
+    return made if fingerprint(made) == parent.get("geometry") else None

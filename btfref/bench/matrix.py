@@ -21,6 +21,7 @@ from btfref.bench import measures
 from btfref.bench.data import materials
 from btfref.bench.subjects import build
 from btfref.bench.timing import machine
+from btfref.querying import off_grid
 
 if TYPE_CHECKING:
     from btfref.bench.plan import Entry, Plan
@@ -141,6 +142,8 @@ def _material(plan: Plan, name: str, btf: SampledBTF, writer: _Writer, progress:
             more = {"file_bytes": path.stat().st_size if path else None}
             writer.add("build", name, entry, {**records[entry.name], **more})
         own = [(entry, path) for entry in plan.entries if (path := paths[entry.name]) is not None]
+        if "off_grid" in plan.measures:
+            _off_grid(plan, name, btf, built, writer, report)
         if "error" in plan.measures:
             for entry in plan.entries:
                 report(f"error of {entry.name}")
@@ -169,6 +172,24 @@ def _material(plan: Plan, name: str, btf: SampledBTF, writer: _Writer, progress:
                     report(f"{kind} of {entry.name}")
                     for record in measure(entry, path, plan):
                         writer.add(kind, name, entry, record)
+
+
+def _off_grid(
+    plan: Plan,
+    name: str,
+    btf: SampledBTF,
+    built: Mapping[str, Built],
+    writer: _Writer,
+    report: Callable[[str], None],
+) -> None:
+    """Answers of every entry at directions that nobody fitted, where the geometry is known."""
+    truth = measures.off_grid_rows(btf, plan)
+    asked = "" if truth is None else writer.queries(f"{name}-off-grid", off_grid.packed(truth))
+    for entry in plan.entries:
+        report(f"{entry.name} off the grid")
+        if truth is not None:
+            answers = measures.off_grid_answers(built[entry.name], truth)
+            writer.add("off_grid", name, entry, {"queries": asked, "values": writer.values(answers)})
 
 
 def _has_cuda() -> bool:

@@ -17,7 +17,9 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from btfref.bench import scenes
+from btfref.bench.data import source_of
 from btfref.bench.timing import interleaved, kernels, peak_memory, reset_peak
+from btfref.querying import off_grid
 from btfref.stress.evaluators import DEFINITION, EVALUATORS, evaluator
 from btfref.stress.lookups import hemisphere
 
@@ -96,6 +98,34 @@ def sample_queries(btf: SampledBTF, n: int, rng: np.random.Generator) -> dict[st
         "w_view": btf.views.vectors[view],
         "expected": btf.values[view, light, row, column].astype(np.float32),
     }
+
+
+def off_grid_rows(btf: SampledBTF, plan: Plan) -> dict[str, dict[str, np.ndarray]] | None:
+    """Path-traced rows at directions that nobody fitted: see `btfref.querying.off_grid`.
+
+    Parameters
+    ----------
+    btf : SampledBTF
+        What is fitted.
+    plan : Plan
+
+    Returns
+    -------
+    dict of dict, or None
+        Footprint → columns; None without the geometry that the BTF is of.
+    """
+    source = source_of(btf)
+    if source is None:
+        return None
+    n, spp = (plan.settings[f"off_grid_{name}"] for name in ("rows", "spp"))
+    return off_grid.true_rows(source, n, spp, max(btf.values.shape[2:4]))
+
+
+def off_grid_answers(built: Built, truth: off_grid.Truth) -> np.ndarray:
+    """Answers to those rows: (footprints, 2, n, 3) float32, B and the variance of its mean over the footprint."""
+    # A peer is asked for values alone.
+    found = off_grid.answers(cast("Representation", built.representation or built), truth)
+    return np.array(list(found.values()), np.float32)
 
 
 def measure_eval(

@@ -16,6 +16,7 @@ import numpy as np
 from btfref.bench.matrix import RESULTS
 from btfref.bench.scenes import BASELINE
 from btfref.errors import InputError
+from btfref.querying import off_grid
 
 if TYPE_CHECKING:
     from btfref.types import Facts, PathLike
@@ -130,6 +131,26 @@ def errors(folder: PathLike, record: Facts) -> Facts:
     }
 
 
+def off_grid_errors(folder: PathLike, record: Facts) -> Facts:
+    """Errors of the answers at directions that nobody fitted.
+
+    Parameters
+    ----------
+    folder : path-like
+    record : dict
+        Of kind "off_grid".
+
+    Returns
+    -------
+    dict
+        Footprint → what `btfref.querying.accuracy.accuracy` finds.
+    """
+    with np.load(Path(folder) / record["queries"]) as stored:
+        truth = off_grid.unpacked(stored)
+    answers = np.load(Path(folder) / record["values"])
+    return off_grid.errors_of(dict(zip(truth, answers, strict=True)), truth)
+
+
 def _root_ratio(top: np.ndarray, bottom: np.ndarray) -> tuple[float, float, float]:
     """√(mean top / mean bottom) and the ends of its 99 % interval, from pairs of samples."""
     if not bottom.any():
@@ -152,7 +173,7 @@ def rows(folder: PathLike, records: list[Facts] | None = None) -> list[Facts]:
     Returns
     -------
     list of dict
-        ``kind``, ``material``, ``entry``, ``query`` (text), and the metrics of the kind.
+        ``kind``, ``material``, ``entry``, ``query`` (text; off the grid, the footprint), and the metrics of the kind.
     """
     records = latest(read_records(folder)) if records is None else records
     plain = {
@@ -183,6 +204,12 @@ def rows(folder: PathLike, records: list[Facts] | None = None) -> list[Facts]:
             base = builds[r["run"], r["material"]]
             row |= {"time": time_of(r), "cold_s": r["cold_s"], "ratio": paired_ratio(r, base)}
             row |= {key: r[key] for key in ("payload", "file_bytes", "peak_bytes")}
+        elif kind == "off_grid":
+            result += [
+                {**row, "query": footprint, **found}
+                for footprint, found in off_grid_errors(folder, r).items()
+            ]
+            continue
         elif kind == "error":
             row |= errors(folder, r)
         elif kind == "eval":

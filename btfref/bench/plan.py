@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from btfref.errors import InputError
+from btfref.querying import off_grid
 
 if TYPE_CHECKING:
     from btfref.types import Facts, PathLike
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 SUFFIX = ".toml"
 
 #: What can be measured, in the order in which it is.
-MEASURES = ("build", "error", "eval", "render", "sampling", "realtime")
+MEASURES = ("build", "off_grid", "error", "eval", "render", "sampling", "realtime")
 
 #: Tables and keys of a plan with their defaults.
 DATA = {
@@ -35,6 +36,8 @@ DATA = {
 }
 ROUNDS = {"build": 1, "eval": 5, "render": 5, "sampling": 5, "realtime": 5}
 SETTINGS: Facts = {
+    "off_grid_rows": off_grid.ROWS,
+    "off_grid_spp": off_grid.SPP,
     "error_samples": 50_000,
     "points": {"numpy": 1 << 14, "drjit": 1 << 20, "glsl": 1 << 18},
     "scenes": ["sphere, suns", "cloth, sky"],

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import random
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from btfref.bench.metrics import latest, read_records, rows
+from btfref.querying import off_grid
 from btfref.report.pareto import Panel, Point, front
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ REPEATED = 1e-6
 
 #: Kinds of records in the order of tables: title and columns.
 KINDS = {
+    "off_grid": "Error at directions that nobody fitted (99 % interval)",
     "build": "Fits",
     "error": "Error at measured entries (99 % interval)",
     "eval": "Evaluations",
@@ -142,8 +144,8 @@ def compared(a: PathLike, b: PathLike) -> list[Facts]:
         if second is None:
             continue
         what = " · ".join(str(k) for k in key if k)
-        if first["kind"] == "error":
-            x, y = first["rmse"], second["rmse"]
+        if first["kind"] in ("error", "off_grid"):
+            x, y = (r["rmse"] if r["kind"] == "error" else r["nrmse"][0] for r in (first, second))
             line = {"what": what + " · RMSE", "first": x, "second": y, "ratio": y / x if x else None}
             result.append(line | {"low": None, "high": None})
         elif "time" in first:
@@ -206,6 +208,11 @@ def _new_kernels(facts: Facts | None) -> str:
     return f"{found[0]} compiled, {found[1]} from disk: {facts['codegen_s'] + facts['backend_s']:.2g} s"
 
 
+def _off_grid(number: int) -> Callable[[Facts], str]:
+    """A column of errors off the grid."""
+    return lambda r: off_grid.cells(r)[number]
+
+
 _NAME = {
     "material": lambda r: r["material"],
     "entry": lambda r: r["entry"],
@@ -213,6 +220,11 @@ _NAME = {
 _QUERY = {**_NAME, "query": lambda r: r["query"]}
 
 _COLUMNS = {
+    "off_grid": {
+        **_NAME,
+        "footprint": lambda r: r["query"],
+        **{head: _off_grid(number) for number, head in enumerate(off_grid.HEADS)},
+    },
     "build": {
         **_NAME,
         "seconds": lambda r: _span(r["time"]),

@@ -102,6 +102,8 @@ def _plan(args: Namespace) -> int:
         for line in table(lines, header=header):
             emit(line)
         emit()
+    if "off_grid" in plan.measures and not any(row["kind"] == "off_grid" for row in found):
+        emit("no errors off the grid: the geometry that the BTF is of is not known")
     return 0
 
 

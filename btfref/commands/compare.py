@@ -1,6 +1,6 @@
 """Compare an image with its reference: errors by pixel class, and gates; exit status 1 when a gate fails.
 
-Errors are taken on linear radiance. --gate names an entry of btfref/gates/tolerances.toml, e.g.
+Errors are taken on linear radiance. --gate names entries of btfref/gates/tolerances.toml, e.g.
 image.noise_free; without it the errors are reported only. --classes is a file that `btfref render --classes`
 wrote.
 
@@ -24,6 +24,7 @@ from btfref.commands.shared.options import (
     add_overwrite,
     add_shadows,
     add_size,
+    words,
 )
 from btfref.commands.shared.printing import GATE_HEADER, Progress, emit, emit_json, gate_cells, number, table
 from btfref.commands.shared.reading import assignments, output_file
@@ -44,7 +45,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("test", metavar="TEST", help="image (EXR or PNG)")
     parser.add_argument("reference", metavar="REFERENCE", help="image of the same size, or a scene")
     parser.add_argument("--classes", metavar="C.png", help="pixel classes")
-    parser.add_argument("--gate", metavar="KEY", help="gate to apply")
+    parser.add_argument("--gate", metavar="KEY[,KEY]", help="gates to apply")
     scene = parser.add_argument_group("when REFERENCE is a scene")
     scene.add_argument("--method", metavar="FILE|KEY", help="the representation, or a method to fit to --btf")
     scene.add_argument("--btf", metavar="BTF", help="sampled BTF (.btf.zarr) for --method KEY")
@@ -78,7 +79,7 @@ def run(args: Namespace) -> int:
         reference = load_image(args.reference)
         classes = load_classes(args.classes) if args.classes else None
         other = read_picture_facts(args.reference)
-        comparison = compare(test, reference, classes=classes, gate=args.gate)
+        comparison = compare(test, reference, classes=classes, gate=words(args.gate))
     else:
         comparison, other = _against_scene(args, test)
         reference = np.asarray(comparison.reference, np.float32)
@@ -134,7 +135,7 @@ def _against_scene(args: Namespace, test: np.ndarray) -> tuple[Comparison, Facts
         "grid": None if noisy else args.grid,
         "shadows": shadows,
     }
-    return judge_image(args.test, found, gates=args.gate), facts
+    return judge_image(args.test, found, gates=words(args.gate)), facts
 
 
 def lines(comparison: Comparison) -> Iterator[str]:

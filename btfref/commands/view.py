@@ -55,7 +55,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Carry the command out."""
-    out = output_file(args.output, ".html") if args.output else None
+    out = output_file(args.output, ".html") if args.output is not None else None
     if len(args.files) > MOST_FILES:
         raise InputError("too many files for a page", got=len(args.files), expected=f"at most {MOST_FILES}")
     if args.port > 65535:

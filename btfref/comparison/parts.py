@@ -25,6 +25,8 @@ class StagePart:
     rmse, delta_e00 : Interval
         They hold the choice of pixels.
     pixels : int
+    beside : bool
+        Not a share of the stage, but the same step by another renderer.
     """
 
     name: str
@@ -32,20 +34,24 @@ class StagePart:
     rmse: Interval
     delta_e00: Interval
     pixels: int
+    beside: bool = False
 
     def to_dict(self) -> Facts:
         """JSON-able form."""
         return {**vars(self), "rmse": self.rmse.to_dict(), "delta_e00": self.delta_e00.to_dict()}
 
 
-def part(name: str, of: str, test: ArrayLike, reference: ArrayLike, display: Display) -> StagePart:
-    """A part of a stage from pictures without noise at pixels that were drawn at random.
+def part(
+    name: str, of: str, test: ArrayLike, reference: ArrayLike, display: Display, *, beside: bool = False
+) -> StagePart:
+    """A part of a stage from pictures without noise at pixels that were drawn at random, or at all.
 
     Parameters
     ----------
     name, of : str
     test, reference : array, shape (pixels, 3)
     display : btfref.comparison.Display
+    beside : bool
 
     Returns
     -------
@@ -57,4 +63,4 @@ def part(name: str, of: str, test: ArrayLike, reference: ArrayLike, display: Dis
         interval(x.mean(), x.std() / np.sqrt(n - 1), confidence=CONFIDENCE, freedom=n - 1)
         for x in (square, difference)
     )
-    return StagePart(name, of, rmse_interval(mse), colour, len(square))
+    return StagePart(name, of, rmse_interval(mse), colour, len(square), beside)

@@ -123,6 +123,10 @@ class GateResult:
             "judged": self.judged,
         }
 
+    def named(self, whose: str) -> GateResult:
+        """The same with a name before its detail: of what it is, where several are judged alike."""
+        return replace(self, detail=f"{whose}{': ' if self.detail else ''}{self.detail}")
+
     def measurement(self) -> Facts:
         """What was measured, JSON-able, without any verdict: `judged` finds that anew."""
         found = self.measured or Measured(self.value)

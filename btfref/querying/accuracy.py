@@ -33,6 +33,8 @@ def accuracy(
     truth: ArrayLike,
     variance: ArrayLike,
     halves: tuple[ArrayLike, ArrayLike] | None = None,
+    *,
+    shared: int = 1,
 ) -> Facts:
     """Errors of answers to rows.
 
@@ -44,6 +46,8 @@ def accuracy(
         Of those means.
     halves : two of array_like, shape (n, 3), optional
         Independent means whose mean `truth` is.
+    shared : int
+        So many rows in turn share what is random of them: intervals are over the choice of such groups.
 
     Returns
     -------
@@ -56,28 +60,32 @@ def accuracy(
     v, q, s = (np.asarray(a, np.float64) for a in (value, truth, variance))
     n = len(v)
     difference = v - q
-    square = _mean((difference**2 - s).mean(-1))
+    square = _mean((difference**2 - s).mean(-1), shared)
     energy = max(float((q**2 - s).mean()), 1e-300)
     rmse = _root(square)
     found: Facts = {
         "rmse": rmse,
         "nrmse": [x / np.sqrt(energy) for x in rmse],
-        "mae": _absolute(v, q, s, halves),
-        "psnr_log": _psnr(v, q, s),
-        "bias": [x / max(float(q.mean()), 1e-300) for x in _listed(_mean(difference.mean(-1)))],
+        "mae": _absolute(v, q, s, halves, shared),
+        "psnr_log": _psnr(v, q, s, shared),
+        "bias": [x / max(float(q.mean()), 1e-300) for x in _listed(_mean(difference.mean(-1), shared))],
         "noise": float(np.sqrt(s.mean())),
         "rows": n,
     }
     if halves is not None:
         shown, *both = (lab(np.clip(np.pi * np.asarray(a, np.float64), 0, 1)) for a in (v, *halves))
         true = lab(np.clip(np.pi * q, 0, 1))
-        found["delta_e00"] = _root(_mean(ciede2000(true, shown) ** 2 - ciede2000(*both) ** 2 / 4))
+        found["delta_e00"] = _root(_mean(ciede2000(true, shown) ** 2 - ciede2000(*both) ** 2 / 4, shared))
     return found
 
 
-def _mean(values: np.ndarray) -> Interval:
-    error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.inf
-    return interval(values.mean(), error, confidence=CONFIDENCE)
+def _mean(values: np.ndarray, shared: int) -> Interval:
+    mean, starts = values.mean(), np.arange(0, len(values), shared)
+    # What groups are off together; the last one may be smaller.
+    off = np.add.reduceat(values - mean, starts)
+    n = len(starts)
+    error = np.sqrt(n / (n - 1) * (off**2).sum()) / len(values) if n > 1 else np.inf
+    return interval(mean, error, confidence=CONFIDENCE)
 
 
 def _listed(found: Interval) -> list[float]:
@@ -89,7 +97,7 @@ def _root(square: Interval) -> list[float]:
 
 
 def _absolute(
-    v: np.ndarray, q: np.ndarray, s: np.ndarray, halves: tuple[ArrayLike, ArrayLike] | None
+    v: np.ndarray, q: np.ndarray, s: np.ndarray, halves: tuple[ArrayLike, ArrayLike] | None, shared: int
 ) -> list[float]:
     """[middle, low, high] of the mean absolute error."""
     above = np.abs(v - q).mean(-1)
@@ -98,15 +106,15 @@ def _absolute(
     else:
         a, b = (v - np.asarray(half, np.float64) for half in halves)
         below = 0.5 * (np.sign(a) * b + np.sign(b) * a).mean(-1)
-    low, high = _mean(below), _mean(above)
+    low, high = _mean(below, shared), _mean(above, shared)
     middle = 0.5 * (max(low.estimate, 0.0) + high.estimate)
     return [middle, max(low.low, 0.0), high.high]
 
 
-def _psnr(v: np.ndarray, q: np.ndarray, s: np.ndarray) -> list[float]:
+def _psnr(v: np.ndarray, q: np.ndarray, s: np.ndarray, shared: int) -> list[float]:
     """[estimate, low, high] of the PSNR of log(1 + B); what is negative counts as 0."""
     shown, true = np.log1p(np.maximum(v, 0)), np.log1p(np.maximum(q, 0))
-    square = _mean(((shown - true) ** 2 - s / (1 + np.maximum(q, 0)) ** 2).mean(-1))
+    square = _mean(((shown - true) ** 2 - s / (1 + np.maximum(q, 0)) ** 2).mean(-1), shared)
     peak = max(float(np.quantile(true, PEAK)), 1e-300)
     return [
         float(20 * np.log10(peak) - 10 * np.log10(max(x, 1e-30)))

@@ -85,10 +85,11 @@ def evaluate(
         values.flush()
         del values
     v, q, s = (np.concatenate(parts) for parts in zip(*judged, strict=True))
+    shared = int(file.attributes["settings"].get("lights_per_path", 1))
     return {
         "rows": file.n,
         "method": str(made.meta.get("method")),
         "filter": filter,
         "file": str(Path(out)),
-        "errors": accuracy(v, q, s) if np.isfinite(s).all() else None,
+        "errors": accuracy(v, q, s, shared=shared) if np.isfinite(s).all() else None,
     }

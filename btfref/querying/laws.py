@@ -275,6 +275,8 @@ class Laws:
     picture : (int, int) or None
         Rows and columns of a picture whose texels share a pair of directions, one row a texel, v down the rows; None
         for a place of its own for every row, uniform on the tile.
+    lights : int
+        Rows in turn that share place, radius and view, each with a light of its own: those of one path.
     """
 
     light: DirectionLaw | None
@@ -282,6 +284,7 @@ class Laws:
     radius: RadiusLaw
     least_z: float = 0.0
     picture: tuple[int, int] | None = None
+    lights: int = 1
 
     def rows(self, seed: int, first: int, count: int) -> dict[str, np.ndarray]:
         """What some rows ask for.
@@ -298,8 +301,13 @@ class Laws:
             ``uv`` (n, 2), ``radius`` (n,), ``w_light``, ``w_view`` (n, 3), ``density`` (n,), the product of all laws'.
         """
         own = draw(seed, 0, first, count)
+        shared = own
+        if self.lights > 1:
+            group = np.arange(first, first + count) // self.lights
+            start = int(group[0]) if count else 0
+            shared = draw(seed, 2, start, int(group[-1]) + 1 - start if count else 0)[group - start]
         if self.picture is None:
-            pair, uv, density = own, own[:, 4:6], np.ones(count)
+            pair, uv, density = np.hstack([own[:, :2], shared[:, 2:]]), shared[:, 4:6], np.ones(count)
         else:
             rows, columns = self.picture
             number, texel = np.divmod(np.arange(first, first + count), rows * columns)
@@ -315,7 +323,7 @@ class Laws:
             w_light, of_light = self.light.sample(pair[:, :2], self.least_z)
             w_view, of_view = self.view.sample(pair[:, 2:4], self.least_z)
             of_pair = of_light * of_view
-        radius, of_radius = self.radius.sample(own[:, 6])
+        radius, of_radius = self.radius.sample(shared[:, 6])
         # A number just below 1 would be 1 in single precision, which is another tile's 0.
         uv = np.minimum(uv.astype(np.float32), np.float32(1 - 2.0**-24))
         found = {
@@ -346,6 +354,7 @@ def laws(
     *,
     max_theta: float = 90.0,
     picture: Sequence[int] | None = None,
+    lights: int = 1,
 ) -> Laws:
     """Laws from their names; see the module.
 
@@ -357,6 +366,8 @@ def laws(
     max_theta : float
         Largest polar angle of directions that follow a law, degrees, (0, 90].
     picture : (int, int), optional
+    lights : int
+        Rows in turn that share place, radius and view.
 
     Raises
     ------
@@ -372,6 +383,13 @@ def laws(
             "a law of both directions", field="light, view", got=HALFDIFF, expected="it for both"
         )
     both = all(names)
+    if lights > 1 and (both or picture is not None):
+        raise InputError(
+            "lights that share a path need a law of their own and a place for all of them",
+            field="lights_per_path",
+            got=lights,
+            expected=f"1 with {HALFDIFF if both else 'pictures'}",
+        )
     least_z = 0.0 if max_theta == 90 else float(np.cos(np.radians(max_theta)))
     return Laws(
         None if both else DirectionLaw.of(light, "light"),
@@ -379,4 +397,5 @@ def laws(
         RadiusLaw.of(radius),
         least_z,
         None if picture is None else (int(picture[0]), int(picture[1])),
+        lights,
     )

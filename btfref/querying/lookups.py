@@ -146,6 +146,10 @@ class LookupSource:
             raise InputError(
                 "lookups have no noise", field="target_error", expected="a geometry as the source"
             )
+        if settings.lights_per_path > 1:
+            raise InputError(
+                "lookups trace no paths", field="lights_per_path", expected="a geometry as the source"
+            )
         self.representation, self.settings = representation, settings
 
     def answer(self, rows: Mapping[str, np.ndarray], number: np.ndarray) -> dict[str, np.ndarray]:

@@ -2,8 +2,9 @@
 
 A sample is a random point of the row's footprint on the sampling plane z = 0; the ray through it along −w_view finds
 the first surface point, so that oblique views get their exact sheared footprint. At every vertex of the path the row's
-light is connected. Nothing is shared: samples are independent of each other, within a row and between rows. One kernel
-traces a vertex of all paths of a batch, and those that go on are packed.
+light is connected. Nothing is shared: samples are independent of each other, within a row and between rows (those of
+`btfref.querying.shared_paths` are not, between rows). One kernel traces a vertex of all paths of a batch, and those
+that go on are packed.
 """
 
 from __future__ import annotations
@@ -110,7 +111,7 @@ class RowPaths(PathEstimator):
             self._row = to_device(mi.UInt32, np.repeat(np.arange(n), count))
             self._sample = to_device(mi.UInt32, np.tile(np.arange(count), n))
             # A buffer for each channel: several scatters to one would be several kernels.
-            self._channels = [dr.empty(mi.Float, n * count) for _ in range(3)]
+            self._channels = [dr.empty(mi.Float, self._answers(n) * count) for _ in range(3)]
             self._layout = (n, count)
         self._first = dr.opaque(mi.UInt32, first)
         self._number = to_device(mi.UInt32, number)
@@ -120,11 +121,15 @@ class RowPaths(PathEstimator):
         lane = dr.arange(mi.UInt32, n * count)
         self._trace(lane, dr.gather(mi.Vector3f, self._views, self._row_of(lane)))
         dr.eval(self._channels)
-        samples = [channel.numpy().reshape(n, count) for channel in self._channels]
+        samples = [channel.numpy().reshape(-1, count) for channel in self._channels]
         mean = np.stack([values.mean(1) for values in samples], -1)
         if count == 1:
-            return mean, np.full((n, 3), np.nan, np.float32)
+            return mean, np.full(mean.shape, np.nan, np.float32)
         return mean, np.stack([values.var(1, ddof=1) for values in samples], -1) / np.float32(count)
+
+    def _answers(self, n: int) -> int:
+        """Means that a pass over n rows of the tables finds."""
+        return n
 
     def _row_of(self, lane: JitArray) -> JitArray:
         import drjit as dr
@@ -191,7 +196,10 @@ class PathSource:
 
     def __init__(self, mesostructure: Mesostructure, settings: QuerySettings, stream: int = 0) -> None:
         self.settings = settings
-        self.paths = RowPaths(mesostructure, settings, stream)
+        from btfref.querying.shared_paths import SharedPaths
+
+        kind = RowPaths if settings.lights_per_path == 1 else SharedPaths
+        self.paths = kind(mesostructure, settings, stream)
         self._brightness: float | None = None
 
     def answer(self, rows: Mapping[str, np.ndarray], number: np.ndarray) -> dict[str, np.ndarray]:

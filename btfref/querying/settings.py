@@ -23,6 +23,9 @@ FOOTPRINTS = {"gaussian": 1.0, "disk": 0.25, "square": 1 / 3}
 #: Rows of a set.
 ROWS = Limit(2**32 - 1, "random numbers of a row are selected by 32 bits")
 
+#: Lights of a path.
+LIGHTS = Limit(1024, "all samples of a group are in memory together")
+
 #: Samples of a row where none are asked for, and the most of one to a target error.
 SPP, MOST_SPP = 16, 4096
 
@@ -49,6 +52,9 @@ class QuerySettings:
         Shape of a footprint on the sampling plane: standard deviation R, radius R, side 2R.
     picture : int or (int, int), optional
         Rows and columns of a picture: as many rows in turn share a pair of directions, one for each of its texels.
+    lights_per_path : int
+        So many rows in turn share place, footprint, view and paths, each with a light of its own: cheaper rows, whose
+        errors are correlated within such a group (and which have no target error, `halfdiff` or picture).
     spp : int, optional
         Independent samples of a row; 1 gives no variance. By default 16. With a target error the most of a row, by
         default 4096.
@@ -75,6 +81,7 @@ class QuerySettings:
     radius: str | float = "0"
     footprint: str = "gaussian"
     picture: int | Sequence[int] | None = None
+    lights_per_path: int = 1
     spp: int | None = None
     target_error: float | None = None
     max_depth: int = 8
@@ -98,6 +105,14 @@ class QuerySettings:
             )
         if self.target_error is not None:
             keep("target_error", _number("target_error", self.target_error, 1e-4, 10))
+        keep("lights_per_path", _whole("lights_per_path", self.lights_per_path, 1, LIGHTS.most))
+        if self.lights_per_path > 1 and self.target_error is not None:
+            raise InputError(
+                "rows that share paths share their number of samples",
+                field="target_error",
+                got=self.target_error,
+                expected="none with lights_per_path",
+            )
         keep("max_theta", _number("max_theta", self.max_theta, 0, 90))
         # These are checked by being made.
         _ = self.samples, self.laws
@@ -128,7 +143,14 @@ class QuerySettings:
                     got=self.n,
                     expected=f"a multiple of {texels}",
                 )
-        return laws(self.light, self.view, self.radius, max_theta=self.max_theta, picture=sides)
+        return laws(
+            self.light,
+            self.view,
+            self.radius,
+            max_theta=self.max_theta,
+            picture=sides,
+            lights=self.lights_per_path,
+        )
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
@@ -155,6 +177,9 @@ class QuerySettings:
             "seed": self.seed,
             "variant": self.variant,
         }
+        if self.lights_per_path > 1:
+            facts["lights_per_path"] = self.lights_per_path
+            facts["shared"] = "rows i with one i // lights_per_path: place, footprint, view, paths"
         for name, law in (("light", self.laws.light), ("view", self.laws.view)):
             if law is not None and law.vectors is not None and law.name == "custom":
                 facts["laws"][f"{name}_directions"] = np.asarray(law.vectors).tolist()

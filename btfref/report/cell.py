@@ -19,6 +19,7 @@ from btfref.images.display import Display, fit_display
 LABELS = {
     "reference": ("Reference", "Mitsuba, the representation's plugin, from the same file and the same scene"),
     "realtime": ("Real-time", "GLSL on float32 targets, the same sub-pixel grid"),
+    "browser": ("WebGL 2", "the same shaders in a headless Chromium, read back as floats"),
     "truth": ("Geometry truth", "the mesostructure itself, path traced"),
     "geometry": ("Geometry truth", "the mesostructure itself, path traced"),
     "representation": (

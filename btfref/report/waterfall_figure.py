@@ -34,7 +34,7 @@ def waterfall_figure(fall: Facts) -> str:
     rows = [(stage["name"], stage) for stage in stages]
     for share in fall["parts"]:
         at = 1 + [name for name, _ in rows].index(share["of"])
-        rows.insert(at, (f"of it {share['name']}", share))
+        rows.insert(at, (f"{'beside it' if share.get('beside') else 'of it'} {share['name']}", share))
     both = [stage[key] for stage in stages for key in ("rmse", "rmse_so_far")]
     largest = max([v["high"] for v in both if v["high"] > 0], default=1.0)
     top = float(np.ceil(np.log10(largest) + 1e-9))
@@ -140,7 +140,8 @@ def waterfall_table(fall: Facts) -> str:
             _cell(stage[key]) for key in keys
         )
         if share := shares.get(stage["name"]):
-            name = f"{share['name']}, a part of it, at {share['pixels']} pixels"
+            how = "beside it" if share.get("beside") else "a part of it"
+            name = f"{share['name']}, {how}, at {share['pixels']} pixels"
             rows += f'</tr><tr><th scope="row">{escape(name)}</th>{_cell(share["rmse"])}<td></td>'
             rows += f"{_cell(share['delta_e00'])}<td></td>"
         rows += "</tr>"

@@ -1,12 +1,15 @@
-"""Directions chosen for a surface: as many as are asked for, where interpolation between the others is wrong most.
+"""Directions chosen for a surface: rings whose angles and counts make interpolation between them least wrong.
 
-A coarse table of the surface at many candidates stands for it. From a pole and a few directions near the horizon on,
-the candidate whose pictures the ones chosen so far interpolate worst is added, as a view and as a light together, each
-error times the solid angle that the candidate stands for. Only inner products of pictures are needed.
+A coarse table of the surface at many candidates stands for it. The error of a choice is that of the pictures of all
+candidates, interpolated between the chosen directions, as views and as lights together, each times the solid angle that
+the candidate stands for. From even rings on, a greedy search moves rings and hands directions from one to another as
+long as that error falls. Rings are interpolated between four directions, scattered sets between three: a free choice of
+directions was no better. Only inner products of pictures are needed.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,12 +22,24 @@ if TYPE_CHECKING:
     from btfref.mesostructure.base import Mesostructure
     from btfref.types import PathLike, Progress
 
+#: Polar angle in degrees and number of directions of each ring.
+Rings = tuple[tuple[float, int], ...]
+
 #: Polar angles of the candidates' rings and their spacing along a ring, degrees.
 RINGS = tuple(np.arange(7.5, 83, 7.5))
 SPACING = 7.5
 
-#: Directions of the outermost ring that every choice begins with, beside the pole.
+#: Azimuths of candidates on a ring: a multiple of this.
 FIRST = 8
+
+#: Polar angle of the outermost ring that a search begins with, and bounds of a ring's angle and of the distance of two.
+OUTER, LARGEST, APART = 75.0, 84.0, 4.0
+
+#: Steps of an angle, degrees, from coarse to fine; layouts that are tried from one start at most.
+STEPS, MOST = (4.0, 2.0, 1.0), 150
+
+#: Fewest directions of a ring beside the pole, and fewest of a choice.
+LEAST, FEWEST = 3, 9
 
 #: Of the coarse table.
 TEXELS, SPP = 4, 16
@@ -71,7 +86,7 @@ def chosen_directions(
     Returns
     -------
     DirectionSet
-        The same for the same seed; sorted by polar angle.
+        The same for the same seed: rings, from the pole on.
 
     Raises
     ------
@@ -81,8 +96,8 @@ def chosen_directions(
     from btfref.sampling.synthesis import synthesize
 
     given = candidates()
-    if not FIRST + 1 <= n <= len(given):
-        raise InputError("directions to choose", field="n", got=n, expected=f"{FIRST + 1} to {len(given)}")
+    if not FEWEST <= n <= len(given):
+        raise InputError("directions to choose", field="n", got=n, expected=f"{FEWEST} to {len(given)}")
     btf = synthesize(
         mesostructure,
         texels=TEXELS,
@@ -106,32 +121,97 @@ def chosen_directions(
             np.tensordot(a * weight[None, :, None], a, ([1, 2], [1, 2]))
             for a in (values, values.swapaxes(0, 1))
         )
-        picked = choose(given, np.asarray(gram), n)
-    return directions(given.vectors[np.sort(picked)])
+        return directions(vectors_of(choose(given, np.asarray(gram), n)))
 
 
-def choose(given: DirectionSet, gram: np.ndarray, n: int) -> np.ndarray:
-    """Numbers of the candidates that are chosen, in the order of the choice.
+def choose(given: DirectionSet, gram: np.ndarray, n: int) -> Rings:
+    """Rings of the choice.
 
     Parameters
     ----------
     given : DirectionSet
-        Candidates: a pole first, rings after it, the last one outermost.
+        Candidates.
     gram : ndarray (m, m)
         Inner products of what belongs to each candidate.
     n : int
+        Directions.
+
+    Returns
+    -------
+    tuple of (float, int)
+        Polar angle in degrees and number of directions of each ring, the pole first.
     """
-    count = int(given.rings[-1, 2])  # type: ignore[index]  # rings they are
-    outer = len(given) - count + np.arange(0, count, count // FIRST)[:FIRST]
-    picked = [0, *map(int, outer)]
-    weight = given.quadrature_weights
-    while len(picked) < n:
-        chosen = directions(given.vectors[picked])
-        index, share = chosen.stencil(given.vectors)
-        near = np.asarray(picked)[index]
-        cross = np.einsum("mk,mk->m", share, gram[np.arange(len(given))[:, None], near])
-        inner = np.einsum("mk,ml,mkl->m", share, share, gram[near[:, :, None], near[:, None]])
-        error = weight * (np.diagonal(gram) - 2 * cross + inner)
-        error[picked] = -np.inf
-        picked.append(int(np.argmax(error)))
-    return np.array(picked)
+    spacing = np.degrees(np.sqrt(2 * np.pi / n))
+    usual = min(1 + round(OUTER / spacing), 1 + (n - 1) // (LEAST + 1))
+    starts = [_even(n, count) for count in range(max(3, usual - 1), max(3, usual + 1) + 1)]
+    return min((_improved(given, gram, start) for start in starts), key=lambda found: found[0])[1]
+
+
+def vectors_of(rings: Rings) -> np.ndarray:
+    """Directions of rings, (n, 3)."""
+    return ring_directions([(theta, count, 0.0) for theta, count in rings])
+
+
+def error_of(given: DirectionSet, gram: np.ndarray, vectors: np.ndarray) -> float:
+    """Squared error of the candidates' pictures, interpolated between directions whose own pictures lie between them.
+
+    Parameters
+    ----------
+    given : DirectionSet
+    gram : ndarray (m, m)
+    vectors : ndarray (n, 3)
+    """
+    known = _shares(given, vectors)
+    left = np.eye(len(given)) - _shares(directions(vectors), given.vectors) @ known
+    return float(given.quadrature_weights @ np.einsum("jk,jk->j", left @ gram, left))
+
+
+def _shares(among: DirectionSet, w: np.ndarray) -> np.ndarray:
+    """Weights of the directions of a set in the interpolation at others, (len(w), len(among))."""
+    index, share = among.stencil(w)
+    found = np.zeros((len(w), len(among)))
+    np.add.at(found, (np.arange(len(w))[:, None], index), share)
+    return found
+
+
+def _even(n: int, count: int) -> Rings:
+    """So many rings of even spacing, and n directions on them."""
+    theta = OUTER * np.arange(1, count) / (count - 1)
+    share = np.sin(np.radians(theta))
+    on = np.maximum(LEAST, np.round((n - 1) * share / share.sum())).astype(int)
+    on[-1] += n - 1 - on.sum()
+    while on[-1] < LEAST:
+        on[on.argmax()] -= 1
+        on[-1] += 1
+    return ((0.0, 1), *((float(t), int(k)) for t, k in zip(theta, on, strict=True)))
+
+
+def _improved(given: DirectionSet, gram: np.ndarray, rings: Rings) -> tuple[float, Rings]:
+    """The error of rings after the search, and what they have become."""
+    error, tried = error_of(given, gram, vectors_of(rings)), 0
+    for step in STEPS:
+        moved = True
+        while moved and tried < MOST:
+            moved = False
+            for other in _neighbours(rings, step):
+                tried += 1
+                found = error_of(given, gram, vectors_of(other))
+                if found < error:
+                    error, rings, moved = found, other, True
+                    break
+    return error, rings
+
+
+def _neighbours(rings: Rings, step: float) -> Iterator[Rings]:
+    """Rings with one of them moved by a step, or with a direction handed from one to another."""
+    for r in range(1, len(rings)):
+        theta, count = rings[r]
+        for moved in (theta + step, theta - step):
+            made = (*rings[:r], (moved, count), *rings[r + 1 :])
+            angles = [angle for angle, _ in made]
+            if angles[-1] <= LARGEST and min(np.diff(angles)) >= APART:
+                yield made
+        for q in range(1, len(rings)):
+            if q != r and rings[q][1] > LEAST:
+                change = {r: 1, q: -1}
+                yield tuple((angle, k + change.get(i, 0)) for i, (angle, k) in enumerate(rings))

@@ -23,6 +23,7 @@ from btfref.scene.shipped import scene_file
 from btfref.validate.cache import key_of
 from btfref.validate.matrix import ENVIRONMENTS
 from btfref.validate.pictures import fitted, make_views, shared_settings, views_key
+from btfref.validate.stages.browser import TITLE, browser_gates, browser_picture, draws, left_out
 from btfref.validate.stages.drawn import code_of
 from btfref.validate.stages.fits import fit_key
 
@@ -81,7 +82,7 @@ class CellResult:
     facts : dict
         JSON-able: ``name``, the axes, ``waterfall``, ``gates``, ``seconds``, ``file``, ``notes``.
     images : dict of str to (H, W, 3) float32 array
-        ``truth``, ``reference``, ``realtime``.
+        ``truth``, ``reference``, ``realtime``, and ``browser`` where one drew.
     classes : (H, W) uint8 array or None
     variance : (H, W, 3) float32 array or None
         Of the reference, where it has noise.
@@ -137,6 +138,7 @@ def cell_key(spec: Spec, settings: Settings) -> str:
         {
             "cell": fit_key(spec.mesostructure, spec.method, settings),
             "views": views_key(spec.mesostructure, spec.scene, spec.lights, settings),
+            "browser": draws(spec.lights, settings),
             "code": code_of(__name__, spec.method),
         }
     )
@@ -212,6 +214,12 @@ def _cell(cache: Cache, spec: Spec, settings: Settings) -> CellResult:
         Picture("8 bits", eight_bits(image.image, display)[None]),
     ]
     parts = [part(*each, display) for each in of_stages]
+    browser = browser_picture(path, spec.lights, settings, shared)
+    in_browser: list[GateResult] = []
+    if browser is not None:
+        seen = browser.image[counts], reference.image[counts]
+        parts.append(part(TITLE, "real time", *seen, display, beside=True))
+        in_browser = browser_gates(browser.image, reference.image, views.classes)
     found = waterfall(chain, counts, display, parts=parts)
     comparison = compare(
         image.image, reference.image, classes=views.classes, gate=gates, variance=reference.variance
@@ -232,11 +240,15 @@ def _cell(cache: Cache, spec: Spec, settings: Settings) -> CellResult:
         "negative_fraction": image.meta["negative_fraction"],
         "gl_renderer": image.meta["gl_renderer"],
         "gl_version": image.meta["gl_version"],
-        "notes": f"{found.explanation} Both renderers read one file and one scene; neither casts shadows.",
+        "webgl_renderer": None if browser is None else browser.meta["gl_renderer"],
+        "notes": f"{found.explanation} All renderers read one file and one scene; none casts shadows."
+        + left_out(spec.lights, settings),
         **facts,
     }
     images = {"truth": views.truth.mean(0), "reference": reference.image, "realtime": image.image}
-    measured = (*comparison.gates, *found.gates)
+    if browser is not None:
+        images["browser"] = browser.image
+    measured = (*comparison.gates, *in_browser, *found.gates)
     facts["gates"] = [gate.to_dict() for gate in measured]
     return CellResult(json_safe(facts), images, views.classes, reference.variance, measured)
 

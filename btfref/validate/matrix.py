@@ -29,6 +29,9 @@ LIGHTS = {
     **{name: {"lights": "envmap", "environment": name} for name in ENVIRONMENTS},
 }
 
+#: Those under which nothing is random.
+DELTA = tuple(name for name in LIGHTS if name not in ENVIRONMENTS)
+
 MESOSTRUCTURES = ("checker", "rings", "tissue")
 
 #: What the quick run shows of each method: every scene once, every kind of light.
@@ -84,10 +87,13 @@ class Settings:
         Paths per pixel and batch of the truth; there are four batches.
     environment_spp : int
         Samples per pixel of the path-traced sampled BTF under an environment, in four batches.
+    browser_lights : tuple of str
+        Delta lights under which the browser draws the pictures as well.
     port_pixels : int
         Pixels at which the approximation under an environment is evaluated in float64.
-    held_out_texels : int
-        Texels along each side for the fits that leave directions out.
+    off_grid_rows, off_grid_spp : int
+        Rows of each footprint at directions that nobody fitted, and samples of each half of one: those of
+        ``btfref bench offgrid``.
     chi2_samples, chi2_intervals : int
         Samples of each χ² test, and intervals a side in which the density is integrated over a cell of its table.
     seed : int
@@ -103,8 +109,10 @@ class Settings:
     environment_grid: int = 2
     truth_spp: int = 128
     environment_spp: int = 1024
+    browser_lights: tuple[str, ...] = DELTA
     port_pixels: int = 64
-    held_out_texels: int = 32
+    off_grid_rows: int = 20_000
+    off_grid_spp: int = 64
     chi2_samples: int = 1_000_000
     chi2_intervals: int | None = None
     seed: int = 0
@@ -129,7 +137,9 @@ QUICK = replace(
     size=48,
     environment_size=40,
     truth_spp=192,
-    held_out_texels=16,
+    browser_lights=("directional3",),
+    off_grid_rows=500,
+    off_grid_spp=32,
     chi2_samples=200_000,
 )
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from types import ModuleType
 from typing import TYPE_CHECKING
 
@@ -69,13 +68,9 @@ def probe_gates(path: PathLike, *, seed: int = 7) -> list[GateResult]:
     for name in present(PORTS):
         value = evaluator(name, representation, path).evaluate(*lookups.points, lod=lookups.lod)
         found = port_agreement(value, representation, lookups.points, lookups.lod)
-        gates += [_named(gate, EVALUATORS[name].title) for gate in found.gates]
+        gates += [gate.named(EVALUATORS[name].title) for gate in found.gates]
         bad += int(np.count_nonzero(~np.isfinite(value)))
     return gates + judge("probe.finite", {"nonfinite": Measured(bad)})
-
-
-def _named(gate: GateResult, whose: str) -> GateResult:
-    return replace(gate, detail=f"{whose}{': ' if gate.detail else ''}{gate.detail}")
 
 
 def sampling_gates(

@@ -22,9 +22,11 @@ from btfref.validate.cell import CellResult, failed_cell, gate_from, make_cell
 from btfref.validate.material import make_material
 from btfref.validate.matrix import FULL, Settings
 from btfref.validate.pictures import make_carrier, make_views
+from btfref.validate.stages.browser import demand_browser
 from btfref.validate.stages.checks import make_checks
 from btfref.validate.stages.drawn import code_of, found, recall
 from btfref.validate.stages.fits import make_fit
+from btfref.validate.stages.off_grid import make_truth
 
 if TYPE_CHECKING:
     from btfref.gates.verdicts import GateResult
@@ -48,7 +50,7 @@ class Validation:
     ----------
     cells : list of CellResult
     methods : list of dict
-        Per mesostructure and method: ``gates`` of its evaluators and its sampling, ``held_out``.
+        Per mesostructure and method: ``gates`` of its evaluators and its sampling, ``off_grid``.
     settings : Settings
     seconds : float
     computed : int
@@ -128,12 +130,15 @@ def validate(
     ------
     InputError
         No cells.
+    MissingDependencyError
+        Without Chromium where ``BTFREF_REQUIRE`` names it.
     BtfrefError
         When a process dies.
     """
     from btfref.provenance import versions
     from btfref.stress.evaluators import PORTS, present
 
+    demand_browser()
     specs = sorted(set(specs))
     if not specs:
         raise InputError("nothing to validate", field="cells", got=0)
@@ -142,7 +147,7 @@ def validate(
     views = sorted({(spec.mesostructure, spec.scene, spec.lights) for spec in specs})
     methods = [list(group) for _, group in groupby(specs, key=lambda s: (s.mesostructure, s.method))]
     stages: list[list[_Job]] = [
-        [(_material_job, (root, name, settings)) for name in materials],
+        [(job, (root, name, settings)) for job in (_material_job, _truth_job) for name in materials],
         [(_views_job, (root, *view, settings)) for view in views],
         [(_method_job, (root, group, settings)) for group in methods],
     ]
@@ -246,6 +251,12 @@ def _material_job(root: PathLike, mesostructure: str, settings: Settings) -> tup
     return None, cache.computed > 0
 
 
+def _truth_job(root: PathLike, mesostructure: str, settings: Settings) -> tuple[None, bool]:
+    cache = Cache(root)
+    make_truth(cache, mesostructure, settings)
+    return None, cache.computed > 0
+
+
 def _views_job(
     root: PathLike, mesostructure: str, scene: str | Path, lights: str, settings: Settings
 ) -> tuple[None, bool]:
@@ -268,7 +279,7 @@ def _method_job(root: PathLike, specs: Sequence[Spec], settings: Settings) -> tu
         cells = [make_cell(cache, spec, settings) for spec in specs]
     except BtfrefError as error:
         gates = [g.to_dict() for g in missing_reference("probe.agreement", str(error))]
-        checks = {"gates": gates, "held_out": None, "notes": str(error)}
+        checks = {"gates": gates, "off_grid": None, "notes": str(error)}
         cells = [failed_cell(spec, str(error)) for spec in specs]
     return {**facts, **json_safe(checks), "cells": cells}, cache.computed > 0
 

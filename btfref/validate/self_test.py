@@ -18,6 +18,7 @@ from btfref.errors import BtfrefError
 from btfref.gates.tolerances import gate_table, limits
 from btfref.gates.verdicts import with_class
 from btfref.platform import shader_directory
+from btfref.system import chromium
 from btfref.validate.injected.bench import Bench
 from btfref.validate.injected.edits import EDITS, copied
 from btfref.validate.injected.faults import FAULTS
@@ -78,7 +79,7 @@ def self_test(*, edits: Sequence[Edit] = EDITS, progress: Progress | None = None
     Returns
     -------
     list of Caught
-        In the order of `FAULTS`, then of the edits.
+        In the order of `FAULTS`, those that are `possible`, then of the edits.
 
     Raises
     ------
@@ -88,11 +89,12 @@ def self_test(*, edits: Sequence[Edit] = EDITS, progress: Progress | None = None
     MissingDependencyError
         Without LLVM or OpenGL.
     """
-    report, total = progress or (lambda *_: None), len(FAULTS) + len(edits)
+    faults = possible()
+    report, total = progress or (lambda *_: None), len(faults) + len(edits)
     results: list[Caught] = []
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder))
-        for fault in FAULTS:
+        for fault in faults:
             report(len(results), total, "injecting faults")
             results.append(_inject(bench, fault))
     for caught in edit_test(edits):
@@ -100,6 +102,11 @@ def self_test(*, edits: Sequence[Edit] = EDITS, progress: Progress | None = None
         results.append(caught)
     report(total, total, "injecting faults")
     return results
+
+
+def possible() -> tuple[Fault, ...]:
+    """Those of `FAULTS` that this machine can look for: pictures of a browser need Chromium."""
+    return tuple(fault for fault in FAULTS if fault.look != "browser" or chromium() is not None)
 
 
 def edit_test(edits: Sequence[Edit] = EDITS) -> Iterator[Caught]:
@@ -191,9 +198,10 @@ def used_gates() -> set[str]:
     set of str
     """
     from btfref.validate import cell, method_gates, own_renderer
+    from btfref.validate.stages import browser
 
     keys = {"image.finite", "waterfall.closure", "environment.agreement", *cell.GATES, *method_gates.GATES}
-    keys.update(*cell.ENVIRONMENT_GATES.values())
+    keys.update(*cell.ENVIRONMENT_GATES.values(), browser.GATES)
     return keys.union(own_renderer.LINEAR, own_renderer.EIGHT_BIT, own_renderer.NOISY)
 
 

@@ -7,28 +7,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from btfref.querying import off_grid
+
 if TYPE_CHECKING:
     from btfref.types import Facts
     from btfref.validate.run import Validation
 
 
-HEADER = [
-    "mesostructure",
-    "method",
-    "cells",
-    "bytes",
-    "sampled BTF",
-    "fit",
-    "port",
-    "real time",
-    "8 bits",
-    "total",
-    "ΔE00",
-    "held out",
-]
-
 #: Columns of stages in the table, by the names of the stages.
-STAGES = HEADER[4:9]
+STAGES = ("sampled BTF", "fit", "port", "real time", "WebGL 2", "8 bits")
+
+#: Columns of errors at directions that nobody fitted, and their names in `btfref.querying.accuracy.accuracy`.
+OFF_GRID = {"off grid ΔE00": "delta_e00", "off grid MAE": "mae"}
+
+HEADER = ["mesostructure", "method", *OFF_GRID, "cells", "bytes", *STAGES, "total", "ΔE00"]
 
 
 def rows(result: Validation) -> list[list[Any]]:
@@ -37,9 +29,9 @@ def rows(result: Validation) -> list[list[Any]]:
     Returns
     -------
     list of list
-        Columns as in `HEADER`: cells passed of all; bytes of the maps; RMSE of each stage alone and of the whole, root
-        of the mean square over the cells of RMSE over the truth's mean; mean ΔE00 of the whole; mean absolute error at
-        held-out directions over the mean.
+        Columns as in `HEADER`: of texels at directions that nobody fitted, root mean square ΔE00 and mean absolute
+        error in 1/sr; cells passed of all; bytes of the maps; RMSE of each stage alone and of the whole, root of the
+        mean square over the cells of RMSE over the truth's mean; mean ΔE00 of the whole.
     """
     table = []
     for facts in result.methods:
@@ -47,21 +39,38 @@ def rows(result: Validation) -> list[list[Any]]:
         cells = [c for c in result.cells if (c.facts["mesostructure"], c.facts["method"]) == mine]
         passed = sum(cell.outcome == "pass" for cell in cells)
         falls = [cell.facts["waterfall"] for cell in cells if cell.facts["waterfall"]]
-        held_out = (facts.get("held_out") or {}).get("held_out", {}).get("mae")
+        between = (facts.get("off_grid") or {}).get(off_grid.SHOWN, {})
         whole = [_relative(fall["total"]["estimate"], fall) for fall in falls]
         colour = [fall["stages"][-1]["delta_e00_so_far"]["estimate"] for fall in falls]
         table.append(
             [
                 *mine,
+                *(between[name][0] if name in between else None for name in OFF_GRID.values()),
                 f"{passed}/{len(cells)}",
                 facts.get("bytes"),
                 *(_root(_stage(fall, name) for fall in falls) for name in STAGES),
                 _root(whole),
                 float(np.mean(colour)) if colour else None,
-                held_out,
             ]
         )
     return table
+
+
+def off_grid_rows(result: Validation) -> tuple[list[str], list[list[str]]]:
+    """Errors at directions that nobody fitted, with 99 % intervals.
+
+    Returns
+    -------
+    header : list of str
+    rows : list of list of str
+        One for each mesostructure, method and footprint; none for methods whose checks failed.
+    """
+    table = [
+        [facts["mesostructure"], facts["method"], footprint, *off_grid.cells(errors)]
+        for facts in result.methods
+        for footprint, errors in (facts.get("off_grid") or {}).items()
+    ]
+    return ["mesostructure", "method", "footprint", *off_grid.HEADS], table
 
 
 def additivity(result: Validation) -> str:

@@ -66,7 +66,7 @@ def test_command_line_and_both_renderers(run):
 
 @pytest.mark.long
 def test_validate(run):
-    """Probe agreement, χ², pictures, waterfall, held-out directions, report."""
+    """Probe agreement, χ², pictures, waterfall, directions that nobody fitted, report."""
     command = ["validate", "--quick", "--only", KEY, "--workers", "1", "--cache", "cache", "-o", "report"]
     result = json.loads(run(*command, "--json"))
     assert result["passed"] is True

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from btfref.cli import main
 from btfref.images import save_image
 from btfref.numerics.sphere.directions import directions
+from btfref.querying import query_file
 from btfref.representations.file.container import save
 from btfref.representations.tabulated import raw
 from btfref.sampling import SampledBTF
@@ -67,6 +68,9 @@ WORDS = [
     "=b",
 ]
 SETS = ["2x2", "ubo81", "1x1", "0x0", "9999x9999", "good.xml", "text.exr", "none.txt", "x"]
+
+ROWS = ["out.queries.zarr", "out.npz", "out.h5", "good.queries.zarr", "out.queries.zarr/x.npz"]
+LAWS = ["uniform", "cosine", "grazing", "halfdiff", *SETS]
 
 #: Commands: positional arguments, and options with what may follow. What takes long is kept small by what comes first.
 GRAMMAR = {
@@ -152,6 +156,46 @@ GRAMMAR = {
         [["good.xml", *FILES]],
         {"--grid": ["1", "x"], "-D": WORDS, "--views": SETS, "--margin": NUMBERS},
     ),
+    "query": (
+        [["flat", "none", *FILES], ["--n"], ["1", "4", "0", "x", "1e99", "1.5"]],
+        {
+            "-o": [*ROWS, *OUTPUTS],
+            "--light": LAWS,
+            "--view": LAWS,
+            "--max-theta": ["85", *NUMBERS],
+            "--radius": ["0.1", "levels:0.1:1,1", "log:0.1:0.2", "levels:0:1", "log:1", *NUMBERS],
+            "--footprint": ["disk", "x"],
+            "--picture": ["2", "2x2", "0x0", *NUMBERS],
+            "--lights-per-path": ["2", "3", "0", "x"],
+            "--spp": ["1", "2", "x"],
+            "--target-error": ["0.5", "0", "x"],
+            "--layout": ["records", "product", "x"],
+            "--max-depth": ["2", "0"],
+            "--overwrite": None,
+            "--json": None,
+        },
+    ),
+    "evaluate": (
+        [FILES, ["good.queries.zarr", *ROWS, *FILES]],
+        {
+            "-o": ["out.npy", *OUTPUTS],
+            "--filter": ["lookups", "level", "point", "x"],
+            "--lookups": ["1", "2", "0", "x"],
+            "--overwrite": None,
+            "--json": None,
+        },
+    ),
+    # Without an output it would serve for ever.
+    "view": (
+        [FILES],
+        {
+            "-o": [*OUTPUTS, *["out.html"] * 3],
+            "--mesh": FILES,
+            "--memory": WORDS,
+            "--port": NUMBERS,
+            "--overwrite": None,
+        },
+    ),
     "bench": ([["none", "compare", "report", *FILES], FILES], {"-o": OUTPUTS}),
     "validate": ([["--only"], ["none"]], {"--workers": NUMBERS[3:4], "-o": OUTPUTS}),
     "stress": ([["--only"], ["none", "x"]], {"-o": OUTPUTS, "--seed": NUMBERS}),
@@ -179,6 +223,7 @@ def material(tmp_path_factory, renderers):
     grid = directions("2x4")
     SampledBTF(values, grid, grid, None, {}).save(folder / "good.btf.zarr")
     save(raw.fit(SampledBTF.load(folder / "good.btf.zarr")), folder / "good.exr")
+    query_file(folder / "good.queries.zarr", folder / "good.exr", n=4, spp=2)
     for name in ("image.exr", "image.png"):
         save_image(folder / name, np.ones((4, 4, 3)))
     (folder / "good.xml").write_text(SCENE)

@@ -145,8 +145,30 @@ def test_all_laws_have_the_same_albedo():
     assert found[0][0] > 5 * np.sqrt(found[0][1])
 
 
-def test_batches_change_no_row():
-    settings = {"n": 120, "spp": 8, "radius": "0.05", "resolution": 16}
+def test_lights_of_one_path_see_what_rows_by_themselves_see():
+    """In the mean and by their variances; two equal lights of a path see the same."""
+    tile = build("checker", resolution=32)
+    settings = {"radius": "0.05", "max_theta": 80.0, "n": 400}
+    rows = QuerySettings(**settings, lights_per_path=4).laws.rows(0, 0, 400)
+    rows["w_light"][3::4] = rows["w_light"][::4]
+    (a, va), (b, vb) = (
+        answers(tile, rows, 64, stream, lights_per_path=lights, **settings)
+        for stream, lights in ((0, 4), (1, 1))
+    )
+    assert np.array_equal(a[3::4], a[::4])
+    assert not np.array_equal(b[3::4], b[::4])
+    noisy = va + vb > 0
+    z = (a - b)[noisy].astype(float) / np.sqrt((va + vb)[noisy])
+    assert noisy.mean() > tolerance("synthesis.seen.min_noisy")
+    assert tolerance("queries.z.min_median") <= np.median(np.abs(z)) <= tolerance("queries.z.median")
+    total = (a.astype(float) - b).mean(-1).reshape(100, 4).mean(1)
+    score = total.mean() / (total.std() / np.sqrt(len(total)))
+    assert 2 * stats.norm.sf(abs(score)) > tolerance("queries.law.significance")
+
+
+@pytest.mark.parametrize("lights", [1, 3])
+def test_batches_change_no_row(lights):
+    settings = {"n": 120, "spp": 8, "radius": "0.05", "resolution": 16, "lights_per_path": lights}
     (whole,) = btfref.queries("checker", batch=120, **settings)
     parts = list(btfref.queries("checker", batch=50, **settings))
     for name, values in whole.items():

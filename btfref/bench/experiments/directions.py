@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from btfref.bench.data import MESOSTRUCTURES
-from btfref.bench.experiments import offgrid
-from btfref.bench.experiments.between import chosen_of, fitted_to
+from btfref.bench.experiments.between import TEXELS, chosen_of, fitted_to
 from btfref.bench.options import Options
 from btfref.bench.timing import machine
+from btfref.querying import off_grid
 
 if TYPE_CHECKING:
     from btfref.numerics.sphere.directions import DirectionSet
@@ -45,10 +45,10 @@ def run(options: Options) -> Facts:
     if options.quick:
         axes = [MESOSTRUCTURES[:1], ("10x5", "adaptive:50")]
     names, sets = chosen_of(axes, options)
-    n, spp = (offgrid.QUICK_ROWS, offgrid.QUICK_SPP) if options.quick else (offgrid.ROWS, offgrid.SPP)
+    n, spp = (off_grid.QUICK_ROWS, off_grid.QUICK_SPP) if options.quick else (off_grid.ROWS, off_grid.SPP)
     summary: Facts = {}
     for k, name in enumerate(names):
-        truth = offgrid.true_rows(name, n, spp)
+        truth = off_grid.true_rows(name, n, spp, TEXELS)
         summary[name] = {}
         for i, label in enumerate(sets):
             options.tell(k * len(sets) + i, len(names) * len(sets), f"{name}, {label}")
@@ -57,11 +57,16 @@ def run(options: Options) -> Facts:
             summary[name][label] = {
                 "directions": count,
                 "pictures": count**2,
-                "errors": offgrid.errors(raw.fit(btf), truth),
+                "errors": off_grid.errors(raw.fit(btf), truth),
             }
     return {
         "suite": "directions",
-        "parameters": {"split": offgrid.SPLIT, "rows": n, "samples": 2 * spp, "max_theta": offgrid.MAX_THETA},
+        "parameters": {
+            "split": off_grid.SPLIT,
+            "rows": n,
+            "samples": 2 * spp,
+            "max_theta": off_grid.MAX_THETA,
+        },
         "summary": summary,
         "machine": machine(),
     }
@@ -82,6 +87,6 @@ def table(result: Facts) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     rows = []
     for name, sets in result["summary"].items():
         for label, found in sets.items():
-            cells = offgrid.cells(found["errors"]["texel"])
+            cells = off_grid.cells(found["errors"][off_grid.SHOWN])
             rows.append((name, label, str(found["directions"]), str(found["pictures"]), *cells))
-    return ("material", "set", "directions", "pictures", *offgrid.HEADS), rows
+    return ("material", "set", "directions", "pictures", *off_grid.HEADS), rows

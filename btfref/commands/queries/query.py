@@ -26,7 +26,7 @@ from btfref.commands.shared.printing import Progress, bytes_text, emit, emit_jso
 from btfref.commands.shared.reading import count, direction_set, number_above, output_file, size
 from btfref.errors import SAMPLES as MANY_SAMPLES
 from btfref.errors import InputError
-from btfref.querying.settings import FOOTPRINTS, MOST_SPP, ROWS, SPP, QuerySettings
+from btfref.querying.settings import FOOTPRINTS, LIGHTS, MOST_SPP, ROWS, SPP, QuerySettings
 
 #: Arguments that are written, and as what: :func:`btfref.commands.shared.paths.check_paths`.
 OUTPUTS = {"output": ""}
@@ -79,6 +79,14 @@ def add_arguments(parser: ArgumentParser) -> None:
         type=sides,
         metavar="N|WxH",
         help="rows go through the texels of pictures, each with a pair of directions",
+    )
+    parser.add_argument(
+        "--lights-per-path",
+        type=count(1, LIGHTS),
+        default=default.lights_per_path,
+        metavar="N",
+        help="rows in turn that share place, footprint, view and paths: cheaper, their errors correlated (default "
+        "%(default)s)",
     )
     parser.add_argument(
         "--spp",

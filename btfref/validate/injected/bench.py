@@ -195,6 +195,15 @@ class Bench:
         gates = (*GATES, "image.shadow_border")
         return compare(image, expected, classes=classes, gate=gates, flip=False).gates
 
+    def browser(self, subject: Subject) -> Gates:
+        """Real time in a browser against the reference."""
+        from btfref.rendering.web.context import webgl
+        from btfref.validate.stages.browser import browser_gates
+
+        scene, parameters, expected, classes = self.reference(subject)
+        image = webgl(scene, parameters=parameters, shadows=False, **SETTINGS).image
+        return browser_gates(image, expected, classes)
+
     def environment(self, subject: Subject, change: str = "") -> Gates:
         """Real time under an environment against a converged reference."""
         from btfref.rendering.gl.realtime import realtime

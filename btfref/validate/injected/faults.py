@@ -157,6 +157,18 @@ FAULTS = (
         ),
     ),
     Fault(
+        "v flipped in the browser",
+        "image.browser.p999",
+        "browser",
+        edit=(HOST, "btf_eval(uv,", "btf_eval(vec2(uv.x, -uv.y),"),
+    ),
+    Fault(
+        "edges rasterized a pixel off in the browser",
+        "image.browser_edges.failing_fraction",
+        "browser",
+        edit=("hosts/mesh.vert", "vec4(position, 1.0);", "vec4(position, 1.0) + vec4(0.042, 0.0, 0.0, 0.0);"),
+    ),
+    Fault(
         "edges a pixel off in eight bits", "image.eight_bit_silhouette.nrmse", "eight_bits", change="shifted"
     ),
     Fault(

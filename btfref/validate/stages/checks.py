@@ -1,4 +1,4 @@
-"""A method's own checks on one mesostructure: evaluators, sampling, directions that were held out."""
+"""A method's own checks on one mesostructure: evaluators, sampling, errors at directions that nobody fitted."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING
 from btfref.comparison.comparison import json_safe
 from btfref.gates.verdicts import judged
 from btfref.validate.cache import key_of
-from btfref.validate.held_out import held_out_error
-from btfref.validate.material import load_material, make_material
 from btfref.validate.stages.drawn import code_of
 from btfref.validate.stages.fits import fit_key, make_fit
+from btfref.validate.stages.off_grid import off_grid_errors, truth_key
 
 if TYPE_CHECKING:
     from btfref.types import Facts
@@ -27,14 +26,14 @@ def make_checks(cache: Cache, mesostructure: str, method: str, settings: Setting
     Returns
     -------
     dict
-        ``gates`` of its evaluators and its sampling, ``held_out``, ``bytes``, ``fit``, ``seconds``.
+        ``gates`` of its evaluators and its sampling, ``off_grid``, ``bytes``, ``fit``, ``seconds``.
     """
     key = key_of(
         {
             "checks": fit_key(mesostructure, method, settings),
             "code": code_of(__name__, method),
             "samples": [settings.chi2_samples, settings.chi2_intervals],
-            "held_out_texels": settings.held_out_texels,
+            "off_grid": truth_key(mesostructure, settings),
         }
     )
 
@@ -47,7 +46,6 @@ def make_checks(cache: Cache, mesostructure: str, method: str, settings: Setting
 
 
 def _measured(cache: Cache, mesostructure: str, key: str, settings: Settings) -> Facts:
-    from btfref.registry import method
     from btfref.representations.file.container import read_info
     from btfref.stress.between_samples import between_gates
     from btfref.validate.method_gates import probe_gates, sampling_gates
@@ -59,12 +57,11 @@ def _measured(cache: Cache, mesostructure: str, key: str, settings: Settings) ->
     gates += sampling_gates(file, samples=settings.chi2_samples, intervals=settings.chi2_intervals)
     info = read_info(file)
     gates += between_gates(key, info["fit"].get("between_samples", {}))
-    btf = load_material(make_material(cache, mesostructure, settings)[0])
-    error = held_out_error(method(key).fit, btf, texels=settings.held_out_texels)
+    error = off_grid_errors(cache, mesostructure, file, settings)
     return json_safe(
         {
             "measured": [gate.measurement() for gate in gates],
-            "held_out": error,
+            "off_grid": error,
             "bytes": info["payload_bytes"],
             "fit": info["fit"],
             "seconds": time.perf_counter() - start,

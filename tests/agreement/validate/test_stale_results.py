@@ -31,7 +31,7 @@ def green(tmp_path_factory):
     cache = tmp_path_factory.mktemp("green") / "cache"
     found = run(cache)
     assert [(name, gate.line) for name, gate in found.failed_gates] == []
-    assert found.computed == found.jobs == 3
+    assert found.computed == found.jobs == 4
     return cache
 
 
@@ -125,12 +125,12 @@ def test_several_processes_count_what_they_compute(cache):
     specs = [Spec(mesostructure, METHOD, scene, lights) for scene in ("plane", VIEW[1])]
     found = validate(specs, settings=SETTINGS, cache=cache, workers=2)
     # The views of the plane and both cells, in one job; the material and the other views are there.
-    assert (found.computed, found.jobs) == (2, 4)
+    assert (found.computed, found.jobs) == (2, 5)
     assert validate(specs, settings=SETTINGS, cache=cache, workers=2).computed == 0
 
 
 #: Modules that make results, and those that only call them.
-STAGES = ("material", "stages.fits", "pictures", "cell", "stages.checks")
+STAGES = ("material", "stages.fits", "pictures", "cell", "stages.checks", "stages.off_grid")
 CALLERS = {"btfref.validate.run", "btfref.validate.injected", "btfref.validate.injected.edits"}
 
 #: A factor in a port that renders and probes see, and no fit.

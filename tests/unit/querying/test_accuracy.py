@@ -42,6 +42,18 @@ def test_the_noise_is_taken_out(material):
     assert plain > found["rmse"][2]
 
 
+def test_rows_that_share_their_errors_say_no_more_than_one(material):
+    _, value, truth, variance, halves = material
+    once = accuracy(value, truth, variance, halves)
+    four = (np.repeat(a, 4, 0) for a in (value, truth, variance, *halves))
+    v, q, s, *both = four
+    shared = accuracy(v, q, s, both, shared=4)
+    for name in ("rmse", "mae", "bias", "psnr_log", "delta_e00"):
+        assert shared[name] == pytest.approx(once[name]), name
+    low, high = accuracy(v, q, s, both)["rmse"][1:]
+    assert high - low < once["rmse"][2] - once["rmse"][1]
+
+
 def test_absolute_errors_without_halves_are_bounded(material):
     true, value, truth, variance, halves = material
     error = np.abs(value - true).mean()

@@ -218,6 +218,11 @@ def test_answers_of_a_method_and_their_errors(file, tmp_path, capsys):
     assert "0.5" in text
 
 
+def test_lookups_share_no_paths(file, tmp_path):
+    with pytest.raises(InputError, match="lights_per_path"):
+        query_file(tmp_path / "rows.queries.zarr", file, n=4, lights_per_path=2)
+
+
 def test_levels_of_detail_answer_footprints(tmp_path):
     """Wide footprints of a method with levels: coarse ones are nearer to the average over the footprint."""
     from btfref.querying.evaluate import evaluate

@@ -99,9 +99,11 @@ def test_radii_follow_their_laws():
     assert RadiusLaw.of(0.25).sample(u)[0].tolist() == [0.25] * len(u)
 
 
-@pytest.mark.parametrize("picture", [None, (4, 8)])
-def test_rows_do_not_depend_on_those_beside_them(picture):
-    law = laws("halfdiff", "halfdiff", "log:0.001:0.1", picture=picture)
+@pytest.mark.parametrize(
+    ("law", "more"), [("halfdiff", {}), ("halfdiff", {"picture": (4, 8)}), ("cosine", {"lights": 3})]
+)
+def test_rows_do_not_depend_on_those_beside_them(law, more):
+    law = laws(law, law, "log:0.001:0.1", **more)
     whole, part = law.rows(11, 0, 4096), law.rows(11, 1003, 77)
     other = law.rows(12, 1003, 77)
     for name, values in part.items():
@@ -118,6 +120,17 @@ def test_a_picture_has_one_pair_of_directions_and_all_its_texels():
     u, v = rows["uv"][:6].T
     assert np.array_equal(u, np.float32(np.tile((np.arange(3) + 0.5) / 3, 2)))
     assert np.array_equal(v, np.float32(np.repeat((np.arange(2) + 0.5) / 2, 3)))
+
+
+@pytest.mark.parametrize("light", ["cosine", "10x5"])
+def test_lights_of_a_path_have_their_own_law_and_all_else_in_common(light):
+    rows = laws(light, "grazing", "log:0.001:0.1", lights=4).rows(5, 0, 4000)
+    for name in ("uv", "radius", "w_view", "w_light"):
+        groups = rows[name].reshape(1000, 4, -1)
+        assert (groups == groups[:, :1]).all() == (name != "w_light")
+        assert len(np.unique(groups[:, 0], axis=0)) > (40 if name == "w_light" else 990)
+    single = laws(light, "grazing", "log:0.001:0.1").rows(5, 0, 4000)
+    assert np.array_equal(rows["w_light"], single["w_light"])
 
 
 @pytest.mark.parametrize(
@@ -143,6 +156,10 @@ def test_a_picture_has_one_pair_of_directions_and_all_its_texels():
         ({"picture": 3, "n": 10}, "multiple of 9"),
         ({"picture": (3, 3, 3)}, "picture"),
         ({"max_depth": 1}, "max_depth"),
+        ({"lights_per_path": 0}, "lights_per_path"),
+        ({"lights_per_path": 2, "light": "halfdiff", "view": "halfdiff"}, "lights_per_path"),
+        ({"lights_per_path": 2, "picture": 2, "n": 8}, "lights_per_path"),
+        ({"lights_per_path": 2, "target_error": 0.1}, "target_error"),
         ({"seed": -1}, "seed"),
     ],
 )

@@ -16,9 +16,10 @@ from schemas import assert_follows_schema
 from btfref.commands.validate import lines
 from btfref.comparison.waterfall import Picture, waterfall
 from btfref.conventions import PixelClass
-from btfref.errors import InputError
+from btfref.errors import InputError, MissingDependencyError
 from btfref.gates import tolerance, tolerances
 from btfref.images.display import Display
+from btfref.querying import off_grid
 from btfref.registry import methods
 from btfref.report.pack import pack, unpack, unpack_text
 from btfref.report.validation import write_validation
@@ -27,10 +28,10 @@ from btfref.validate.cell import GATES, CellResult, eight_bits, failed_cell, rea
 from btfref.validate.cell import _save as save_cell
 from btfref.validate.material import material_key
 from btfref.validate.matrix import FULL, LIGHTS, MESOSTRUCTURES, QUICK, SCENES, Spec, select
-from btfref.validate.run import Validation
-from btfref.validate.stages import drawn
+from btfref.validate.run import Validation, validate
+from btfref.validate.stages import browser, drawn
 from btfref.validate.stages.fits import fit_key
-from btfref.validate.summary import HEADER, rows
+from btfref.validate.summary import HEADER, off_grid_rows, rows
 
 
 def test_selection():
@@ -151,6 +152,25 @@ def test_another_browser_makes_other_keys(tmp_path, monkeypatch):
     assert drawn.driver().endswith("Chromium 157.0")
 
 
+def test_without_a_browser_its_pictures_are_left_out_or_demanded(monkeypatch):
+    lights = QUICK.browser_lights[0]
+    assert set(QUICK.browser_lights) < set(FULL.browser_lights)
+    monkeypatch.delenv("BTFREF_REQUIRE", raising=False)
+    monkeypatch.setattr(browser, "chromium", lambda: "chromium")
+    assert browser.draws(lights, QUICK)
+    assert not browser.draws("sky", FULL)
+    assert browser.left_out(lights, QUICK) == ""
+    monkeypatch.setattr(browser, "chromium", lambda: None)
+    assert not browser.draws(lights, QUICK)
+    assert "Chromium is not on this machine" in browser.left_out(lights, QUICK)
+    assert browser.left_out("sky", QUICK) == ""
+    browser.demand_browser()
+    for wanted in ("chromium", "gl, chromium", "all"):
+        monkeypatch.setenv("BTFREF_REQUIRE", wanted)
+        with pytest.raises(MissingDependencyError, match="Chromium"):
+            validate([Spec("checker", "lpca", "sphere", lights)])
+
+
 def test_evaluators_that_took_no_part_are_named(monkeypatch):
     result = Validation([], [], QUICK, facts={"absent": ["webgl"]})
     assert [line for line in lines(result) if line.startswith("not run: webgl;")]
@@ -220,14 +240,14 @@ def result(rng):
         measured = (*made.comparison().gates, *fall.gates)
         facts["gates"] = [g.to_dict() for g in measured]
         cells.append(replace(made, measured=measured))
-    held = {"seen": {"rmse": 0.1, "mae": 0.1}, "held_out": {"rmse": 0.3, "mae": 0.2}}
-    held |= {"views": [41, 40], "lights": [41, 40]}
+    errors = {name: [0.2, 0.1, 0.3] for name in ("rmse", "nrmse", "mae", "psnr_log", "bias")}
+    errors |= {"delta_e00": [8.5, 8.0, 9.0], "noise": 0.01, "rows": 500}
     of_methods = [
         {
             "mesostructure": "checker",
             "method": key,
             "gates": cells[0].facts["gates"][:1],
-            "held_out": held,
+            "off_grid": {footprint: errors for footprint in off_grid.FOOTPRINTS},
             "bytes": n,
         }
         for key, n in (("lpca", 3000), ("svd", 1000))
@@ -280,7 +300,15 @@ def test_summary_has_a_row_a_method(result):
     ]
     fall = result.cells[0].facts["waterfall"]
     assert table[0]["total"] == pytest.approx(fall["total"]["estimate"] / fall["mean"])
-    assert table[0]["held out"] == 0.2
+    assert table[0]["off grid ΔE00"] == 8.5
+    assert table[0]["off grid MAE"] == 0.2
+    header, lines = off_grid_rows(result)
+    assert [line[:3] for line in lines[:3]] == [["checker", "lpca", name] for name in off_grid.FOOTPRINTS]
+    assert dict(zip(header, lines[0], strict=True))["ΔE00"] == "8.50 (8.00 to 9.00)"
+    # Where the checks failed there is no error to show.
+    none = replace(result, methods=[{**facts, "off_grid": None} for facts in result.methods])
+    assert rows(none)[0][2] is None
+    assert off_grid_rows(none)[1] == []
 
 
 DRIVER = """<script>
@@ -349,6 +377,7 @@ def test_the_report_works_from_disk(result, tmp_path, need, width):
     assert len(cells) == 2
     text += "".join(cells)
     assert "Where the error comes from" in text
+    assert "8.50 (8.00 to 9.00)" in text
     assert not re.search(r'(src|href)="https?:', text)
 
 
@@ -407,3 +436,6 @@ def test_hostile_names_cannot_break_the_pages(result, tmp_path):
 def test_settings_say_how_finely():
     assert FULL.texels > QUICK.texels
     assert FULL.size > QUICK.size
+    # The rows of benchmarks.
+    assert (FULL.off_grid_rows, FULL.off_grid_spp) == (off_grid.ROWS, off_grid.SPP)
+    assert (QUICK.off_grid_rows, QUICK.off_grid_spp) == (off_grid.QUICK_ROWS, off_grid.QUICK_SPP)
