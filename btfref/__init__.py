@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from btfref.comparison import compare
     from btfref.numerics.sphere.directions import DirectionSet
     from btfref.querying.batches import queries
+    from btfref.refining import refine
     from btfref.rendering.gl.realtime import realtime
     from btfref.rendering.offline.reference import render
     from btfref.representations.protocol import Representation
@@ -38,6 +39,7 @@ __all__ = [
     "load",
     "queries",
     "realtime",
+    "refine",
     "render",
     "save",
     "synthesize",
@@ -49,6 +51,7 @@ _HOMES = {
     "SampledBTF": "btfref.sampling",
     "compare": "btfref.comparison",
     "queries": "btfref.querying.batches",
+    "refine": "btfref.refining",
     "realtime": "btfref.rendering.gl.realtime",
     "render": "btfref.rendering.offline.reference",
     "synthesize": "btfref.sampling.synthesis",

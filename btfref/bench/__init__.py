@@ -16,6 +16,7 @@ SUITES = {
     "gbrdf": "btfref.bench.experiments.gbrdf",
     "lobes": "btfref.bench.experiments.lobes",
     "lod": "btfref.bench.experiments.lod",
+    "gradients": "btfref.bench.optimisation.gradients",
     "offgrid": "btfref.bench.experiments.offgrid",
     "proposals": "btfref.bench.experiments.proposals",
     "pyramid": "btfref.bench.experiments.pyramid",

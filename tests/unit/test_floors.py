@@ -19,6 +19,7 @@ btfref.report
 btfref.validate
 btfref.stress
 btfref
+btfref.refining
 btfref.rendering
 btfref.scene
 mitsuba_plugins btfref.formats btfref.querying
