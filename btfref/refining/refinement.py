@@ -8,30 +8,27 @@ the start is not taken.
 
 from __future__ import annotations
 
+import os
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics.device_arrays import to_device
 from btfref.numerics.sphere.quadrature import gauss_hemisphere
-from btfref.querying.footprints import offset
 from btfref.refining.losses import LOSSES
-from btfref.refining.rows import Rows, rows_of
+from btfref.refining.objectives import at_pixels, at_rows
+from btfref.refining.rows import rows_of
 from btfref.refining.variables import Variables
 
 if TYPE_CHECKING:
+    from btfref.refining.objectives import Objective
     from btfref.representations.protocol import Representation
     from btfref.sampling import SampledBTF
-    from btfref.types import Facts, JitArray, PathLike, Progress
-
-#: Largest share of rows that are held out, and the most of them.
-HELD_OUT, MOST_HELD_OUT = 0.1, 1 << 14
-
-#: Random places in the footprint of a row.
-LOOKUPS = 4
+    from btfref.types import Facts, JitArray, PathLike, Progress, SceneLike
 
 #: Steps between two looks at the held-out rows, and looks without progress after which the search ends.
 PERIOD, PATIENCE = 20, 8
@@ -41,6 +38,9 @@ LAST_RATE = 0.05
 
 #: Texels, views and rule over the lights of the check of energy.
 ENERGY_TEXELS, ENERGY_VIEWS, ENERGY_RULE = 128, 8, (6, 16)
+
+#: By which the limit of albedos may be exceeded: halves.
+ENERGY_ROUNDING = 1e-3
 
 #: Halvings of the way from the start, where its end reflects too much.
 HALVINGS = 6
@@ -96,6 +96,8 @@ def refine(
     seed: int = 0,
     maps: Sequence[str] | None = None,
     footprint: str = "square",
+    scene: SceneLike | None = None,
+    parameters: Mapping[str, object] | None = None,
     progress: Progress | None = None,
 ) -> Representation:
     """Move the maps of a fit so that its values are nearer to true ones.
@@ -105,13 +107,17 @@ def refine(
     representation : Representation or path-like
         The start; of any method whose maps have derivatives.
     data : path-like, SampledBTF or dict of ndarray
-        Queries, a sampled BTF, or columns of rows: see `btfref.refining.rows.rows_of`.
+        Queries, a sampled BTF, or columns of rows: see `btfref.refining.rows.rows_of`. With ``scene`` a picture of it
+        (``.exr``), linear radiance.
     loss, steps, batch, rate, seed
         See :class:`Settings`. Same seed, same result on the same machine, up to the order in which threads add up.
     maps : sequence of str, optional
         Some of the maps, by their names in ``mi.traverse``; default: all that have derivatives and can be stored.
     footprint : str
         Shape of the footprints of columns.
+    scene, parameters
+        What the picture shows: as `btfref.render` takes them, without ``btf``, which is the representation. Its one
+        material of that file is moved; it is rendered by ``prb``.
     progress : callable, optional
         ``progress(done, total, label)``.
 
@@ -128,109 +134,60 @@ def refine(
     MissingDependencyError
         Without LLVM or CUDA.
     """
+    from btfref.representations import load, save
     from btfref.representations.protocol import Representation as Protocol
 
     settings = Settings(loss, steps, batch, rate, seed)
-    if not isinstance(representation, Protocol):
-        from btfref.representations import load
-
-        representation = load(representation)
+    start = representation if isinstance(representation, Protocol) else load(representation)
+    chosen = None if maps is None else list(maps)
     rng = np.random.default_rng(seed)
-    rows = rows_of(data, rng, footprint=footprint)
-    if len(rows) < 2:
-        raise InputError("too few rows to hold some out", field="data", got=len(rows), expected="at least 2")
-    order = rng.permutation(len(rows))
-    n_held = int(np.clip(HELD_OUT * len(rows), 1, MOST_HELD_OUT))
-    held, used = rows.part(order[:n_held]), rows.part(order[n_held:])
-    variables = Variables(representation, None if maps is None else list(maps))
-    before = Judge(held, settings).loss_of(variables)
+    if scene is None:
+        used, held, facts = at_rows(rows_of(data, rng, footprint=footprint), loss, batch, seed, rng)
+        return _refined(Variables(start, chosen), used, held, settings, facts, rng, progress)
+    if not isinstance(data, str | os.PathLike):
+        raise InputError(
+            "what a scene is compared with", field="data", got=type(data).__name__, expected="a picture"
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        # The scene reads a file: this one, also where the start has none.
+        file = Path(folder) / "start.exr"
+        save(start, file)
+        with at_pixels(file, data, scene, parameters or {}, loss, seed, rng) as (used, held, material, facts):
+            return _refined(Variables(start, chosen, material), used, held, settings, facts, rng, progress)
+
+
+def _refined(
+    variables: Variables,
+    used: Objective,
+    held: Objective,
+    settings: Settings,
+    facts: Facts,
+    rng: np.random.Generator,
+    progress: Progress | None,
+) -> Representation:
+    """The refined representation, with its history."""
+    variables.put(variables.zeros())
+    before = held.whole(variables)
     if not np.isfinite(before):
-        raise InputError("values of the start are not finite at some rows", field="data", got=rows.source)
-    best, history = _search(
-        variables, Judge(used, settings), Judge(held, settings), before, settings, rng, progress
-    )
-    made, after, albedo, share = _taken(variables, best, held, settings, before)
-    facts: Facts = {
-        "data": rows.source,
-        "rows": len(used),
-        "held_out": len(held),
-        **vars(settings),
-        "maps": list(variables.names),
-        "steps_taken": history[-1][0] if history else 0,
-        "history": history,
-        "before": before,
-        "after": after,
-        "share": share,
-        "albedo": albedo,
-    }
+        raise InputError("values of the start are not finite somewhere", field="data", got=facts["data"])
+    best, history = _search(variables, used, held, before, settings, rng, progress)
+    made, found = _taken(variables, best, held, settings, before)
+    done = {"steps_taken": history[-1][0], "history": history, "before": before}
+    facts = facts | vars(settings) | {"maps": list(variables.names)} | done | found
     meta = made.meta | {"refined": [*made.meta.get("refined", []), facts]}
     return type(made).from_arrays(dict(made.arrays()), meta)
 
 
-class Judge:
-    """The loss of rows.
-
-    Parameters
-    ----------
-    rows : Rows
-    settings : Settings
-    """
-
-    def __init__(self, rows: Rows, settings: Settings) -> None:
-        import mitsuba_plugins
-
-        mi = mitsuba_plugins.ready()
-        self.rows, self.settings = rows, settings
-        self.level = max(float(np.abs(rows.columns["B"]).mean(dtype=float)), 1e-12)
-        columns = rows.columns
-        self.lookups = LOOKUPS if (columns["radius"] > 0).any() else 1
-        self._packed = {
-            "place": to_device(mi.Float, np.concatenate([columns["uv"], columns["radius"][:, None]], 1)),
-            **{name: to_device(mi.Float, columns[name]) for name in ("w_light", "w_view", "B")},
-        }
-        # The same places at each look.
-        self._fixed = np.random.default_rng(settings.seed + 1).random((len(rows), self.lookups, 2))
-
-    def loss(self, variables: Variables, index: np.ndarray, places: np.ndarray | None = None) -> JitArray:
-        """Mean loss of some rows by the maps as they are put, as a Float; ``places`` are random numbers."""
-        import drjit as dr
-        import mitsuba as mi
-
-        places = self._fixed[index] if places is None else places
-        n, k = places.shape[:2]
-        at = to_device(mi.UInt32, np.repeat(index, k))
-        shift = offset(self.rows.footprint, places.reshape(n * k, 2))
-        u, v, radius = dr.gather(mi.Vector3f, self._packed["place"], at)
-        uv = mi.Point2f(
-            dr.fma(radius, to_device(mi.Float, shift[:, 0]), u),
-            dr.fma(radius, to_device(mi.Float, shift[:, 1]), v),
-        )
-        w_light, w_view = (dr.gather(mi.Vector3f, self._packed[name], at) for name in ("w_light", "w_view"))
-        above = (w_light.z > 0) & (w_view.z > 0)
-        value = dr.select(above, variables.evaluator.evaluate(uv, w_light, w_view, above), mi.Color3f(0))
-        if k > 1:
-            value = mi.Color3f(*(dr.block_sum(channel, k) * (1 / k) for channel in value))
-        truth = dr.gather(mi.Color3f, self._packed["B"], to_device(mi.UInt32, index))
-        return dr.mean(LOSSES[self.settings.loss](value, truth, self.level))
-
-    def loss_of(self, variables: Variables) -> float:
-        """Mean loss of all rows by the maps as they are put."""
-        import drjit as dr
-
-        with dr.suspend_grad():
-            return float(self.loss(variables, np.arange(len(self.rows)))[0])
-
-
 def _search(
     variables: Variables,
-    used: Judge,
-    held: Judge,
+    used: Objective,
+    held: Objective,
     before: float,
     settings: Settings,
     rng: np.random.Generator,
     progress: Progress | None,
-) -> tuple[dict[str, JitArray], list[tuple[int, float]]]:
-    """The variables that are best on the held-out rows, and (step, held-out loss) as it went."""
+) -> tuple[dict[str, JitArray], list[list[float]]]:
+    """The variables that are best on what is held out, and [step, held-out loss] as it went."""
     import drjit as dr
     import mitsuba as mi
 
@@ -238,17 +195,14 @@ def _search(
     for name, z in variables.zeros().items():
         optimizer[name] = z
     best, least, waited = variables.zeros(), before, 0
-    history = [(0, before)]
-    n, size = len(used.rows), min(settings.batch, len(used.rows))
+    history = [[0, before]]
     for step in range(settings.steps):
         if progress is not None:
             progress(step, settings.steps, "refine")
         fall = 0.5 * (1 + np.cos(np.pi * step / settings.steps))
-        optimizer.set_learning_rate(settings.rate * (LAST_RATE + (1 - LAST_RATE) * fall))
+        optimizer.set_learning_rate(settings.rate * (LAST_RATE + (1 - LAST_RATE) * float(fall)))
         variables.put(dict(optimizer.items()))
-        # With replacement where rows are many: no pass over all of them is needed.
-        index = rng.integers(0, n, size) if size < n else np.arange(n)
-        dr.backward(used.loss(variables, index, rng.random((size, used.lookups, 2))))
+        dr.backward(used.batch(variables, rng))
         optimizer.step()
         for name, z in variables.held(dict(optimizer.items())).items():
             optimizer[name] = z
@@ -256,8 +210,8 @@ def _search(
             continue
         now = {name: type(z)(dr.detach(z)) for name, z in optimizer.items()}
         variables.put(now)
-        found = held.loss_of(variables)
-        history.append((step + 1, found))
+        found = held.whole(variables)
+        history.append([step + 1, found])
         waited += 1
         if found < least:
             best, least, waited = now, found, 0
@@ -267,23 +221,24 @@ def _search(
 
 
 def _taken(
-    variables: Variables, best: Mapping[str, JitArray], held: Rows, settings: Settings, before: float
-) -> tuple[Representation, float, Facts, float]:
+    variables: Variables, best: Mapping[str, JitArray], held: Objective, settings: Settings, before: float
+) -> tuple[Representation, Facts]:
     """The rounded maps, as far on the way to the best ones as energy allows; the start where these are no better."""
-    start = variables.representation
+    start = variables.start
     albedo = largest_albedo(start, settings.seed)
-    limit = max(1.0, albedo) * (1 + 1e-3)
+    limit = max(1.0, albedo) * (1 + ENERGY_ROUNDING)
     share = 1.0
     for _ in range(HALVINGS):
-        made = variables.representation_of(best, share)
+        made = variables.representation(best, share)
         found = largest_albedo(made, settings.seed)
         if found <= limit:
-            after = Judge(held, settings).loss_of(Variables(made, list(variables.names)))
+            variables.put_maps(made)
+            after = held.whole(variables)
             if after < before:
-                return made, after, {"before": albedo, "after": found}, share
+                return made, {"after": after, "share": share, "albedo": [albedo, found]}
             break
         share *= 0.5
-    return start, before, {"before": albedo, "after": albedo}, 0.0
+    return start, {"after": before, "share": 0.0, "albedo": [albedo, albedo]}
 
 
 def largest_albedo(representation: Representation, seed: int = 0) -> float:

@@ -38,10 +38,13 @@ class Variables:
     representation : Representation
     maps : sequence of str, optional
         Port arrays to move; default: all that the method differentiates by and that can be stored.
+    material : mitsuba.BSDF, optional
+        Of the plugin ``btf``, whose maps are moved; default: an evaluator of its own.
 
     Attributes
     ----------
     names : tuple of str
+    start : Representation
     evaluator : mitsuba_plugins.protocol.Evaluator
         Reads the maps that `put` has set.
 
@@ -51,16 +54,21 @@ class Variables:
         For a map that cannot be moved, or a method without any.
     """
 
-    def __init__(self, representation: Representation, maps: list[str] | None = None) -> None:
+    def __init__(
+        self, representation: Representation, maps: list[str] | None = None, material: JitArray = None
+    ) -> None:
         import mitsuba_plugins
 
         mi = mitsuba_plugins.ready()
         from mitsuba_plugins.lib.maps import Maps
         from mitsuba_plugins.protocol import HoldsFixed
 
-        self.representation = representation
-        self._maps = Maps(representation, representation.meta["filter_type"])
-        self.evaluator = method(representation.meta["method"]).evaluator(self._maps)
+        self.start = representation
+        if material is None:
+            self._maps = Maps(representation, representation.meta["filter_type"])
+            self.evaluator = method(representation.meta["method"]).evaluator(self._maps)
+        else:
+            self._maps, self.evaluator = material.maps, material.evaluator
         fixed = self.evaluator.fixed if isinstance(self.evaluator, HoldsFixed) else ()
         found = layout(representation)
         known = [name for name in self._maps.masters(fixed) if name in found.numbers]
@@ -103,21 +111,36 @@ class Variables:
     def put(self, variables: Mapping[str, JitArray]) -> None:
         """Let the evaluator read the maps of some variables; gradients pass."""
         import drjit as dr
+
+        self._put({n: dr.fma(z, self._size[n], self._start[n]) for n, z in variables.items()})
+
+    def put_maps(self, representation: Representation) -> None:
+        """Let the evaluator read those of a representation that was made of these."""
         import mitsuba as mi
 
-        for name, z in variables.items():
-            shape = self._maps.tensors[name].shape
-            self._maps.tensors[name] = mi.TensorXf(dr.fma(z, self._size[name], self._start[name]), shape)
+        ports = representation.port_arrays()
+        self._put({name: to_device(mi.Float, ports[name].astype(np.float32)) for name in self.names})
+
+    def _put(self, values: Mapping[str, JitArray]) -> None:
+        import mitsuba as mi
+
+        for name, array in values.items():
+            self._maps.tensors[name] = mi.TensorXf(array, self._maps.tensors[name].shape)
         self.evaluator.update(self._maps)
 
-    def representation_of(self, variables: Mapping[str, JitArray], share: float = 1.0) -> Representation:
+    @property
+    def tensors(self) -> dict[str, JitArray]:
+        """The maps as they were put."""
+        return {name: self._maps.tensors[name] for name in self.names}
+
+    def representation(self, variables: Mapping[str, JitArray], share: float = 1.0) -> Representation:
         """The representation of some variables, or of a share of the way to them, rounded to its types."""
         changed = {
             name: self._start[name].numpy().astype(float)
             + share * self._size[name].numpy().astype(float) * z.numpy()
             for name, z in variables.items()
         }
-        return restored(self.representation, changed)
+        return restored(self.start, changed)
 
 
 def _ranges(

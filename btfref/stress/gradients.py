@@ -30,6 +30,10 @@ STEP = 0.01
 #: Share of a map's root mean square by which values near zero are moved as well.
 LEAST = 0.01
 
+#: Steps of Adam, how far a map is moved away before them, relative to its root mean square, and the rate of the first
+#: one, relative to that.
+STEPS, AWAY, FIRST_RATE = 20, 0.3, 0.25
+
 #: The gate.
 GATE = "gradient.maps"
 
@@ -117,6 +121,44 @@ class Subject:
         alone = [self.slope([name]) for name in self.names]
         return [*alone, self.slope(self.names)]
 
+    def approach(self, name: str, *, steps: int = STEPS) -> tuple[float, float]:
+        """RMSE of the picture before and after steps of Adam, towards that of the map as it was, from one moved away.
+
+        Every value of the map is moved by `AWAY` of the map's root mean square, up or down.
+
+        Returns
+        -------
+        before, after : float
+            Relative to the picture's mean.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        key, start = _MATERIAL + name, self._start[name]
+        target = self._picture()
+        size = AWAY * float(np.sqrt((np.array(start, float) ** 2).mean()))
+        sign = np.random.default_rng(1).choice([-size, size], start.shape).astype(np.float32)
+        optimizer = mi.ad.Adam(lr=size)
+        optimizer[key] = start + type(start)(sign)
+        self.parameters.update(optimizer)
+        before = _rmse(self._picture(), target)
+        for step in range(steps):
+            optimizer.set_learning_rate(FIRST_RATE * size * (1 - step / steps))
+            picture = mi.render(self.scene, self.parameters, spp=SPP, seed=_SEED, seed_grad=_SEED + 1 + step)
+            dr.backward(dr.mean(dr.square(picture - target), axis=None))
+            optimizer.step()
+            self.parameters.update(optimizer)
+        after = _rmse(self._picture(), target)
+        self._put({name: type(start)(start)})
+        return before, after
+
+    def _picture(self) -> JitArray:
+        import drjit as dr
+
+        sensor = self.scene.sensors()[0]
+        with dr.suspend_grad():
+            return self.scene.integrator().render(self.scene, sensor, seed=_SEED, spp=SPP)
+
     def _put(self, values: dict[str, JitArray]) -> None:
         self.parameters.update({_MATERIAL + name: value for name, value in values.items()})
 
@@ -129,9 +171,7 @@ class Subject:
         import mitsuba as mi
 
         self._put(self._moved(maps, dr.opaque(mi.Float, t)))
-        sensor = self.scene.sensors()[0]
-        picture = self.scene.integrator().render(self.scene, sensor, seed=_SEED, spp=SPP)
-        return float(np.array(picture, float).mean())
+        return float(np.array(self._picture(), float).mean())
 
     def _forward(self, maps: Sequence[str]) -> float:
         import drjit as dr
@@ -163,6 +203,11 @@ class Subject:
             float((np.array(dr.grad(value), float) * np.array(self._direction[name], float)).sum())
             for name, value in own.items()
         )
+
+
+def _rmse(picture: JitArray, target: JitArray) -> float:
+    a, b = np.array(picture, float), np.array(target, float)
+    return float(np.sqrt(((a - b) ** 2).mean()) / b.mean())
 
 
 def gradient_gates(slopes: Sequence[Slope]) -> list[GateResult]:

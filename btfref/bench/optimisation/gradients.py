@@ -1,8 +1,8 @@
 """Are derivatives by maps right? Every method, storage, filter and map, alone and all together, and 20 steps of Adam.
 
 The derivatives are those of `btfref.stress.gradients`: of the mean of a rendered picture, forward and backward, against
-differences of means in float64. The steps start from a fit to a flat grey surface, which has the default shape of
-`lpca` or another method, and go towards a picture of the fit itself.
+differences of means in float64. The steps begin at a map that was moved away, and go towards the picture of the map as
+it was: of the largest error that a map can make up for, all can be undone.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from btfref.conventions import FILTER_TYPES
 from btfref.errors import InputError
 from btfref.registry import methods
 from btfref.stress.data import bumpy
+from btfref.stress.gradients import STEPS
 
 if TYPE_CHECKING:
     from btfref.registry import Method
@@ -49,7 +50,8 @@ def run(options: Options) -> Facts:
     -------
     dict
         ``summary``: "method, storage, filter" → ``slopes``: maps, difference, forward, backward, relative to the mean,
-        and ``deviation``; ``gates``; ``warnings``: texts of warnings; ``raw``: seconds; ``parameters``; ``machine``.
+        and ``deviation``; ``steps``: map → RMSE over the mean before and after steps of Adam; ``gates``; ``warnings``:
+        texts of warnings; ``raw``: seconds of processor time; ``parameters``; ``machine``.
 
     Raises
     ------
@@ -106,8 +108,10 @@ def measured(path: Path, filter_type: str, *, together: bool = False) -> Facts:
         warnings.simplefilter("always")
         subject = Subject(mitsuba_plugins.load(path, filter_type=filter_type))
         slopes = [subject.slope(subject.names)] if together else subject.slopes()
+        walked = {} if together else {name: subject.approach(name) for name in subject.names}
     return {
         "slopes": [vars(slope) | {"deviation": slope.deviation, "silent": slope.silent} for slope in slopes],
+        "steps": walked,
         "gates": [gate.to_dict() for gate in gradient_gates(slopes)],
         "warnings": [str(one.message) for one in told],
     }
@@ -122,6 +126,9 @@ def table(result: Facts) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
             name = slope["maps"][0] if len(slope["maps"]) == 1 else "all"
             cells = (f"{slope[what]:+.3e}" for what in ("difference", "forward", "backward"))
             deviation = "silent" if slope["silent"] else f"{slope['deviation']:.1e}"
-            rows.append((*label.split(", "), name, *cells, deviation, "pass" if passed else "FAIL"))
-    heads = ("difference / mean", "forward", "backward", "deviation", "")
+            before, after = found["steps"].get(name, (0.0, 0.0))
+            steps = f"{before:.1e} to {after:.1e}" if before else "–"
+            verdict = "pass" if passed else "FAIL"
+            rows.append((*label.split(", "), name, *cells, deviation, steps, verdict))
+    heads = ("difference / mean", "forward", "backward", "deviation", f"RMSE, {STEPS} steps", "")
     return ("method", "storage", "filter", "map", *heads), rows
