@@ -66,7 +66,7 @@ class AtRows:
         self._place = to_device(mi.Float, place)
         self._known = {name: to_device(mi.Float, columns[name]) for name in ("w_light", "w_view", "B")}
         self._lookups = LOOKUPS if (columns["radius"] > 0).any() else 1
-        self._fixed = np.random.default_rng([seed, 1]).random((len(rows), self._lookups, 2))
+        self._seed = seed
 
     def batch(self, variables: Variables, rng: np.random.Generator) -> JitArray:
         """See :class:`Objective`."""
@@ -79,8 +79,10 @@ class AtRows:
         """See :class:`Objective`."""
         import drjit as dr
 
+        n = len(self._rows)
+        places = np.random.default_rng([self._seed, 1]).random((n, self._lookups, 2))
         with dr.suspend_grad():
-            return float(self._mean(variables, np.arange(len(self._rows)), self._fixed)[0])
+            return float(self._mean(variables, np.arange(n), places)[0])
 
     def _mean(self, variables: Variables, index: np.ndarray, places: np.ndarray) -> JitArray:
         import drjit as dr

@@ -37,7 +37,7 @@ PERIOD, PATIENCE = 20, 8
 LAST_RATE = 0.05
 
 #: Texels, views and rule over the lights of the check of energy.
-ENERGY_TEXELS, ENERGY_VIEWS, ENERGY_RULE = 128, 8, (6, 16)
+ENERGY_TEXELS, ENERGY_VIEWS, ENERGY_RULE = 64, 6, (5, 12)
 
 #: By which the limit of albedos may be exceeded: halves.
 ENERGY_ROUNDING = 1e-3

@@ -93,7 +93,9 @@ def rows_of(
     if path.name.endswith(".zarr") or path.is_dir():
         return _samples(SampledBTF.load(path, variance=False), rng)
     raise InputError(
-        "nothing to refine by", file=path, expected=f"queries (NAME{ENDING}) or a sampled BTF (NAME.btf.zarr)"
+        "nothing to refine by",
+        file=path,
+        expected=f"queries (NAME{ENDING}), a sampled BTF (NAME.btf.zarr), or a picture (.exr) and its scene",
     )
 
 

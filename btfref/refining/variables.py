@@ -81,11 +81,15 @@ class Variables:
                 "the method has no map that can be refined", field="method", got=representation.meta["method"]
             )
         self.names = tuple(maps or known)
+        # Computed from the others, and read beside them.
+        ports = representation.port_arrays()
+        self._derived = tuple(
+            n for n in self._maps.masters(fixed) if ports[n].dtype.kind == "f" and n not in known
+        )
         sizes, low, high = _ranges(representation, found)
         self._start: dict[str, JitArray] = {}
         self._size: dict[str, JitArray] = {}
         self._bounds: dict[str, tuple[JitArray, JitArray]] = {}
-        ports = representation.port_arrays()
         for name in self.names:
             start = ports[name].astype(np.float64).ravel()
             size = found.ported(sizes, name, 1.0).ravel()
@@ -119,7 +123,8 @@ class Variables:
         import mitsuba as mi
 
         ports = representation.port_arrays()
-        self._put({name: to_device(mi.Float, ports[name].astype(np.float32)) for name in self.names})
+        names = (*self.names, *self._derived)
+        self._put({name: to_device(mi.Float, ports[name].astype(np.float32)) for name in names})
 
     def _put(self, values: Mapping[str, JitArray]) -> None:
         import mitsuba as mi

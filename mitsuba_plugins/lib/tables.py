@@ -129,8 +129,8 @@ class PairTable:
         outer = outer * self.n_views
         pairs = [pair for neighbour in views for pair in neighbour.single()]
         total = mi.Color3f(0) if total is None else total
-        unrolled = self.words is None or self.width <= UNROLLED_WIDTH
-        if unrolled or dr.grad_enabled(coefficients, pairs, [light.single() for light in lights]):
+        weights = pairs, [light.single() for light in lights]
+        if self.width <= UNROLLED_WIDTH or self.differentiated or dr.grad_enabled(coefficients, weights):
             for view, weight in pairs:
                 total = self._add_view(total, outer + view, weight, lights, coefficients, active)
             return total
