@@ -21,6 +21,7 @@ SUITES = {
     "proposals": "btfref.bench.experiments.proposals",
     "pyramid": "btfref.bench.experiments.pyramid",
     "queries": "btfref.bench.experiments.queries",
+    "refinement": "btfref.bench.optimisation.refinement",
     "reflectance": "btfref.bench.experiments.reflectance",
     "synth": "btfref.bench.synth",
 }

@@ -102,7 +102,7 @@ def run(options: Options) -> Facts:
     }
 
 
-def true_rows(name: str, n: int, spp: int) -> dict[str, dict[str, np.ndarray]]:
+def true_rows(name: str, n: int, spp: int, *, texels: int = TEXELS) -> dict[str, dict[str, np.ndarray]]:
     """Rows of every footprint with two independent means of each.
 
     Parameters
@@ -111,6 +111,8 @@ def true_rows(name: str, n: int, spp: int) -> dict[str, dict[str, np.ndarray]]:
         Of a mesostructure.
     n, spp : int
         Rows of a footprint, samples of each half.
+    texels : int
+        Along a side of the tile: footprints are measured in them.
 
     Returns
     -------
@@ -120,7 +122,7 @@ def true_rows(name: str, n: int, spp: int) -> dict[str, dict[str, np.ndarray]]:
     from btfref.querying.job import QueryJob
 
     result = {}
-    for number, (footprint, texels) in enumerate(FOOTPRINTS.items()):
+    for number, (footprint, half) in enumerate(FOOTPRINTS.items()):
         job = QueryJob.of(
             name,
             None,
@@ -129,7 +131,7 @@ def true_rows(name: str, n: int, spp: int) -> dict[str, dict[str, np.ndarray]]:
                 "spp": spp,
                 "seed": SPLIT + number,
                 "max_theta": MAX_THETA,
-                "radius": texels / TEXELS,
+                "radius": half / texels,
                 "footprint": "square",
             },
         )
