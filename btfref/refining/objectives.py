@@ -153,9 +153,10 @@ class AtPixels:
         import drjit as dr
         import mitsuba as mi
 
-        tensors = variables.tensors
+        # What `mi.render` looks for: the maps whose derivatives it is to pass on.
+        maps = mi.SceneParameters({n: (a, None, None, 0) for n, a in variables.tensors.items()}, {})
         picture = mi.render(
-            self._scene, tensors, integrator=self._integrator, spp=SPP, seed=seed, seed_grad=seed + 1
+            self._scene, maps, integrator=self._integrator, spp=SPP, seed=seed, seed_grad=seed + 1
         )
         value = dr.gather(mi.Color3f, picture.array, self._index) * (1 / np.pi)
         return dr.mean(self._loss(value, self._truth, self._level))
@@ -201,7 +202,9 @@ def at_pixels(
     height, width = picture.shape[:2]
     with loaded(scene, {**parameters, "btf": str(file)}, size=(width, height)) as made:
         tell_camera(made, SPP**-0.5)
-        found = {id(one): one for shape in made.shapes() for one in shown_by(shape.bsdf())}
+        found: dict[int, JitArray] = {
+            id(one): one for shape in made.shapes() for one in shown_by(shape.bsdf())
+        }
         own = [one for one in found.values() if Path(one.filename).samefile(file)]
         if len(own) != 1:
             raise InputError("materials of the scene with this file", file=file, got=len(own), expected=1)

@@ -116,6 +116,7 @@ def _checked(columns: Mapping[str, np.ndarray | None], footprint: str, source: s
         got = "nothing" if column is None else np.shape(column)
         if got != shape:
             raise InputError("a column of the rows", field=name, got=got, expected=shape)
+        assert column is not None
         found[name] = np.ascontiguousarray(column, np.float32)
         if not np.isfinite(found[name]).all():
             raise InputError("a value that is not finite", field=name)

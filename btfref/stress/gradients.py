@@ -157,7 +157,10 @@ class Subject:
 
         sensor = self.scene.sensors()[0]
         with dr.suspend_grad():
-            return self.scene.integrator().render(self.scene, sensor, seed=_SEED, spp=SPP)
+            picture = self.scene.integrator().render(self.scene, sensor, seed=_SEED, spp=SPP)
+        # Else each step would trace it anew.
+        dr.eval(picture)
+        return picture
 
     def _put(self, values: dict[str, JitArray]) -> None:
         self.parameters.update({_MATERIAL + name: value for name, value in values.items()})
