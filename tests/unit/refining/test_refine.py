@@ -12,12 +12,16 @@ from btfref.cli import main
 from btfref.comparison.colour import ciede2000, lab
 from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
+from btfref.images import save_image
 from btfref.refining.losses import LOSSES
 from btfref.refining.refinement import largest_albedo
 from btfref.refining.variables import Variables
 
 #: Few lobes: the derivative's kernel is compiled sooner, and is no other code.
 STEPS = 40
+
+#: By which the truth is brighter than the start.
+BRIGHTER = 1.3
 
 
 @pytest.fixture(scope="module")
@@ -31,12 +35,12 @@ def start(btf):
 
 
 @pytest.fixture(scope="module")
-def rows(btf):
-    """True values that no file of one lobe meets: those of the table, brighter."""
+def rows(start):
+    """True values that the maps can meet: their own, brighter."""
     rng = np.random.default_rng(5)
     n = 4000
     found = {"uv": rng.random((n, 2)), "w_light": hemisphere(rng, n), "w_view": hemisphere(rng, n)}
-    found["B"] = 1.3 * btfref.fit("raw", btf).evaluate(*found.values())
+    found["B"] = BRIGHTER * start.evaluate(*found.values())
     return found
 
 
@@ -74,7 +78,7 @@ def test_types_and_ranges_are_kept(start, refined):
 
 def test_what_gets_worse_is_not_taken(start, rows):
     """Steps as large as the maps themselves lead nowhere: the start comes back."""
-    made = btfref.refine(start, rows | {"B": start.evaluate(*list(rows.values())[:3])}, steps=1, rate=1.0)
+    made = btfref.refine(start, rows | {"B": rows["B"] / BRIGHTER}, steps=1, rate=1.0)
     facts = made.meta["refined"][0]
     assert (facts["share"], facts["after"]) == (0.0, facts["before"])
     for name, array in made.arrays().items():
@@ -97,6 +101,33 @@ def test_a_sampled_btf_and_the_command(btf, start, tmp_path, need, capsys):
     facts = json.loads(capsys.readouterr().out)
     assert facts["data"] == "data.btf.zarr"
     assert btfref.load(files[2]).meta["refined"] == [facts]
+
+
+@pytest.mark.long
+def test_a_picture(start, tmp_path, need):
+    """Of a scene with a brighter material: its pixels, rendered anew by ``prb``, are followed."""
+    need("llvm")
+    arrays = {name: array.copy() for name, array in start.arrays().items()}
+    arrays["colour"][..., :3] *= np.float16(BRIGHTER)
+    bright = type(start).from_arrays(arrays, start.meta)
+    btfref.save(bright, tmp_path / "bright.exr")
+    shown = {"lights": "directional1"}
+    picture = btfref.render(
+        "plane", parameters=shown | {"btf": str(tmp_path / "bright.exr")}, size=(12, 12), spp=64
+    )
+    save_image(tmp_path / "picture.exr", picture.image)
+    made = btfref.refine(
+        start,
+        tmp_path / "picture.exr",
+        scene="plane",
+        parameters=shown,
+        loss="log",
+        steps=20,
+        maps=["colour"],
+    )
+    facts = made.meta["refined"][0]
+    assert (facts["data"], facts["rows"] + facts["held_out"]) == ("picture.exr", 144)
+    assert facts["after"] <= tolerance("refine.picture.left") * facts["before"]
 
 
 def test_start_values_stay_at_the_start(start, need):
