@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from btfref.datasets.package import dataset
     from btfref.numerics.sphere.directions import DirectionSet
     from btfref.querying.batches import queries
+    from btfref.refining import refine
     from btfref.rendering.gl.realtime import realtime
     from btfref.rendering.offline.reference import render
     from btfref.representations.protocol import Representation
@@ -40,6 +41,7 @@ __all__ = [
     "load",
     "queries",
     "realtime",
+    "refine",
     "render",
     "save",
     "synthesize",
@@ -52,6 +54,7 @@ _HOMES = {
     "compare": "btfref.comparison",
     "dataset": "btfref.datasets.package",
     "queries": "btfref.querying.batches",
+    "refine": "btfref.refining",
     "realtime": "btfref.rendering.gl.realtime",
     "render": "btfref.rendering.offline.reference",
     "synthesize": "btfref.sampling.synthesis",

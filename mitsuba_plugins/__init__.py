@@ -11,6 +11,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from btfref.representations.protocol import Representation
     from btfref.types import JitArray, PathLike
 
 _registered: set[str] = set()
@@ -66,6 +67,34 @@ def load(path: PathLike, **parameters: object) -> JitArray:
         From Mitsuba, with the reason of the plugin: a file or a parameter that it does not take.
     """
     return ready().load_dict({"type": "btf", "filename": str(path), **parameters})
+
+
+def representation_of(bsdf: JitArray) -> Representation:
+    """The representation that a material shows now, with the maps that were changed through ``mi.traverse``.
+
+    Parameters
+    ----------
+    bsdf : mitsuba.BSDF
+        Of the plugin ``btf``, or with one inside, such as ``twosided``.
+
+    Returns
+    -------
+    Representation
+        For `btfref.save`; its maps have the types of the file, to which changed ones are rounded.
+
+    Raises
+    ------
+    InputError
+        Where there is none or more than one, for a changed map that is computed from others (slopes and gloss of a
+        g-BRDF), or a value that the map's type does not hold.
+    """
+    from btfref.errors import InputError
+    from mitsuba_plugins.protocol import shown_by
+
+    found = shown_by(bsdf)
+    if len(found) != 1:
+        raise InputError("materials of the plugin 'btf'", got=len(found), expected=1)
+    return found[0].representation()
 
 
 def _takes_the_plugin(variant: str | None) -> bool:

@@ -5,6 +5,7 @@ Nothing else in the project uses ``wi`` and ``wo``.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -19,11 +20,11 @@ from btfref.registry import method
 from mitsuba_plugins.lib.footprint import LevelOfDetail
 from mitsuba_plugins.lib.frame import hand_of
 from mitsuba_plugins.lib.guide import LightGuide
-from mitsuba_plugins.lib.lookup import direction_table, valid_directions
+from mitsuba_plugins.lib.lookup import valid_directions
+from mitsuba_plugins.lib.maps import Maps
 from mitsuba_plugins.lib.parameters import refuse_unknown
 from mitsuba_plugins.lib.proposals import Guided, Mixture
-from mitsuba_plugins.lib.tables import tensor
-from mitsuba_plugins.protocol import Displaced, LevelledEvaluator, Proposes
+from mitsuba_plugins.protocol import Displaced, HoldsFixed, LevelledEvaluator, Proposes
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,29 +34,7 @@ if TYPE_CHECKING:
     from mitsuba_plugins.protocol import Proposal
 
 
-class Maps:
-    """The maps of a representation on the device, and the shared tables of an evaluator.
-
-    Attributes
-    ----------
-    tensors : dict of str to TensorXf, TensorXf16 or TensorXu
-        Port layout (last axis a multiple of 4).
-    views, lights : RingTable or TriangleTable
-    shape : tuple of int
-        Rows and columns of texels.
-    filter_type : str
-    meta : dict
-    """
-
-    def __init__(self, representation: Representation, filter_type: str) -> None:
-        arrays = representation.port_arrays()
-        self.meta = representation.meta
-        self.shape = tuple(self.meta["texels"])
-        self.filter_type = filter_type
-        self.views, self.lights = direction_table(arrays, "view"), direction_table(arrays, "light")
-        self.tensors = {
-            name: tensor(array) for name, array in arrays.items() if not name.startswith(("view_", "light_"))
-        }
+__all__ = ["Maps", "make_bsdf"]
 
 
 def make_bsdf() -> type:
@@ -86,6 +65,10 @@ def make_bsdf() -> type:
         camera     point     from where distances count; default: the origin of each ray
         ========== ========= ==================================================================================
 
+        ``mi.traverse`` offers ``scale`` and the maps that can be differentiated, in float32 whatever their type in the
+        file; :func:`mitsuba_plugins.representation_of` makes a representation of them again. Integer maps and codes of
+        8 bits are not offered.
+
         Values hold the light's cosine already. The surface reflects on its front side only; wrap it in
         ``twosided`` for both. Methods without levels of detail ignore the parameters that choose one.
         """
@@ -98,13 +81,10 @@ def make_bsdf() -> type:
             self.filename = _parameter(props, "filename", None)
             if self.filename is None:
                 raise InputError("the plugin 'btf' needs a file", field="filename")
-            representation = load(
-                str(mi.file_resolver().resolve(str(self.filename))),
-                views=_indices(props, "views"),
-                lights=_indices(props, "lights"),
-                entries=_indices(props, "entries"),
-                levels=_indices(props, "levels"),
-            )
+            path = str(mi.file_resolver().resolve(str(self.filename)))
+            kept = {name: _indices(props, name) for name in ("views", "lights", "entries", "levels")}
+            self._read = partial(load, path, **kept)
+            representation = self._read()
             own = representation.meta["filter_type"]
             self.filter_type = _choice(props, "filter_type", own, FILTER_TYPES)
             self.scale = mi.Float(_number(props, "scale", 1.0, least=0.0))
@@ -269,17 +249,20 @@ def make_bsdf() -> type:
 
         def traverse(self, callback: JitArray) -> None:
             callback.put("scale", self.scale, mi.ParamFlags.Differentiable)
-            for name, values in self.maps.tensors.items():
-                integer = dr.is_integral_v(values.array)
-                flag = mi.ParamFlags.NonDifferentiable if integer else mi.ParamFlags.Differentiable
-                callback.put(name, values, flag)
+            fixed = self.evaluator.fixed if isinstance(self.evaluator, HoldsFixed) else ()
+            for name, values in self.maps.masters(fixed).items():
+                callback.put(name, values, mi.ParamFlags.Differentiable)
             if self.detail is not None:
                 self.detail.traverse(callback)
 
         def parameters_changed(self, keys: list[str]) -> None:
-            # A moved camera changes no map. Without keys anything may have changed.
-            if not keys or any(key in self.maps.tensors for key in keys):
+            # A moved camera changes no map.
+            if self.maps.take_over(keys):
                 self.evaluator.update(self.maps)
+
+        def representation(self) -> Representation:
+            """See :func:`mitsuba_plugins.representation_of`; the file is read anew, since no copy is kept."""
+            return self.maps.put_into(self._read())
 
         def to_string(self) -> str:
             return (

@@ -27,13 +27,16 @@ class Evaluator(Port):
     #: What samples light directions unless told otherwise; measured by ``btfref bench proposals``.
     sampling = "both"
 
+    #: Hits are found by a march through the heights, which has no derivative by them.
+    fixed = ("cells",)
+
     def update(self, maps: Maps) -> None:
         """Take over changed maps."""
         tensors = maps.tensors
         self.field = HeightField(tensors["cells"].array, self.shape, self.constants)
         self.surface, self.gloss = as_float32(tensors["surface"]), as_float32(tensors["gloss"])
         self.colour, self.ndf = as_float32(tensors["colour"]), ParabolicMaps(tensors["ndf"], 1)
-        self.half_vectors = HalfVectors(tensors["ndf"].numpy())
+        self.half_vectors = HalfVectors(dr.detach(tensors["ndf"]).numpy())
 
     def hit(self, uv: JitArray, w_view: JitArray, active: JitArray) -> tuple[Hit, JitArray]:
         """The point that a view ray hits, for :meth:`evaluate`, and its texture coordinates, for sampling."""
@@ -69,7 +72,7 @@ class Evaluator(Port):
             material, amount, _, _ = dr.gather(mi.Vector4f, self.gloss, texel, here)
             diffuse += weight * mi.Color3f(red, green, blue)
             share = weight * amount * dr.fma(1 - r0, fifth, r0)
-            gloss += share * self.ndf.lookup(mi.UInt32(material), stencil, active)
+            gloss += share * self.ndf.lookup(_index(material), stencil, active)
         value = dr.fma(diffuse, light * dr.inv_pi, gloss * factor)
         return dr.select(active, value, 0)
 
@@ -85,7 +88,7 @@ class Evaluator(Port):
             nearest, most = dr.select(weight > most, texel, nearest), dr.maximum(weight, most)
         red, green, blue, r0 = dr.detach(dr.gather(mi.Vector4f, self.colour, nearest, active))
         material, amount, _, _ = dr.detach(dr.gather(mi.Vector4f, self.gloss, nearest, active))
-        material = mi.UInt32(material)
+        material = _index(material)
         # Albedos: of the gloss as if all half vectors were the normal, ∫ 4 p F g (k·h) dω_h.
         cosine = dr.clip(dr.dot(w_view, frame[2]), 0.05, 1)
         fresnel = dr.fma(1 - r0, (1 - cosine) ** 5, r0)
@@ -127,6 +130,11 @@ class Evaluator(Port):
         scale = 1 / dr.select(there, length, 1)
         c, s = dr.select(there, c * scale, 1), dr.select(there, s * scale, 0)
         return c * u + s * v, c * v - s * u, normal
+
+
+def _index(material: JitArray) -> JitArray:
+    """Index of a material, which stands among floats: the nearest whole number, so that a small step changes none."""
+    return mi.UInt32(material + 0.5)
 
 
 def _unit(v: JitArray) -> JitArray:

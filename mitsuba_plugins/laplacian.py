@@ -95,7 +95,6 @@ class Evaluator(Port):
     def update(self, maps: Maps) -> None:
         """Take over changed maps."""
         tensors = maps.tensors
-        self.differentiable = any(dr.grad_enabled(tensors[name]) for name in ("basis", "weights"))
         self.basis = Bands(tensors["basis"], self.lights.following(), self.counts)
         self.weights, self.width = as_float32(tensors["weights"]), tensors["weights"].shape[-1]
         self.mean, self.phong = None, None
@@ -131,12 +130,11 @@ class Evaluator(Port):
             # A level that is not kept gives no number, and is not fetched.
             finest = dr.select(lod < self.first_level, dr.nan, 1)
             lod = dr.maximum(lod, self.first_level)
-        if self.differentiable:
+        if self._differentiated(total, uv, views, lights, lod):
             # Gradients do not reach variables that a loop captures.
             for k in range(self.base, self.n_levels):
-                total = self._with_level(
-                    total, mi.UInt32(k), along, views, lights, lod, active & (lod < k + 1)
-                )
+                here = active & (lod < k + 1)
+                total = self._with_level(total, mi.UInt32(k), along, views, lights, lod, here, unrolled=True)
             return _rgb(total.value()) * finest
 
         def body(level: JitArray, total: SplitSum) -> tuple[JitArray, SplitSum]:
@@ -151,6 +149,19 @@ class Evaluator(Port):
         )
         return _rgb(total.value()) * finest
 
+    def _differentiated(
+        self,
+        total: SplitSum,
+        uv: JitArray,
+        views: list[Neighbour],
+        lights: list[Neighbour],
+        lod: JitArray,
+    ) -> bool:
+        """Whether gradients by anything that the levels read are being recorded."""
+        weights = [neighbour.single() for neighbour in (*views, *lights)]
+        read = total.high, total.rest, uv, weights, lod, self.weights
+        return self.basis.differentiated or dr.grad_enabled(read)
+
     def _with_level(
         self,
         total: SplitSum,
@@ -160,8 +171,10 @@ class Evaluator(Port):
         lights: list[Neighbour],
         lod: JitArray,
         active: JitArray,
+        *,
+        unrolled: bool = False,
     ) -> SplitSum:
-        """The sum in Y, Cb, Cr with a level."""
+        """The sum in Y, Cb, Cr with a level; ``unrolled`` without loops."""
         share = dr.clip(1 - lod + mi.Float(level), 0, 1)
         rows, columns, first, _ = dr.gather(mi.Array4u, self.sizes, level, active)
         shape = dr.maximum(rows, 1), dr.maximum(columns, 1)
@@ -181,7 +194,7 @@ class Evaluator(Port):
         coefficient = [mi.Float(0) for _ in range(self.basis.ends[-1])]
         if step is None:
             coefficient = lookup(coefficient, uv, share, active)
-        elif self.differentiable:
+        elif unrolled:
             _, weight = probes(ratio)
             reach = int(ANISOTROPY) // 2
             for j in range(-reach, reach + 1):

@@ -23,7 +23,6 @@ class Evaluator(Port):
     def update(self, maps: Maps) -> None:
         """Take over changed maps."""
         weights = maps.tensors["weights"]
-        self.differentiable = dr.grad_enabled(weights) or dr.grad_enabled(maps.tensors["basis"])
         self.basis = PairTable(maps.tensors["basis"], self.lights.following())
         self.weights, self.width = as_float32(weights), weights.shape[-1]
         # Padding of the index map served the shader's texels only.
@@ -48,7 +47,7 @@ class Evaluator(Port):
         if len(texels) == 1:
             ((cluster, coefficient),) = texels
             return self.basis.combine(cluster, views, lights, coefficient, active)
-        if self.differentiable:
+        if self.basis.differentiated or dr.grad_enabled([c for _, c in texels]):
             # Gradients do not reach variables that a loop captures.
             parts = [self.basis.combine(cluster, views, lights, c, active) for cluster, c in texels]
             return sum(parts[1:], parts[0])

@@ -12,6 +12,7 @@ from btfref.types import JitArray
 
 if TYPE_CHECKING:
     from btfref.numerics.sphere.frames import Turn
+    from btfref.representations.protocol import Representation
     from mitsuba_plugins.base import Maps
 
 
@@ -74,6 +75,19 @@ class Displaced(Evaluator, Protocol):
         """
 
 
+@runtime_checkable
+class HoldsFixed(Evaluator, Protocol):
+    """Has maps of floats that its values are not differentiated by, such as heights that rays are marched through.
+
+    Attributes
+    ----------
+    fixed : tuple of str
+        Their names. They are not offered by ``mi.traverse``.
+    """
+
+    fixed: tuple[str, ...]
+
+
 class Proposal(Protocol):
     """Proposes light directions for one view."""
 
@@ -114,6 +128,9 @@ class ShowsMethod(Protocol):
 
     evaluator: Evaluator
     turn: Turn
+
+    def representation(self) -> Representation:
+        """What it shows now; see :func:`mitsuba_plugins.representation_of`."""
 
 
 def shown_by(bsdf: JitArray) -> list[ShowsMethod]:

@@ -452,6 +452,19 @@ ROWS = [
             ("no packages", "board mine.row.json -o site", ("no package", "flat"), one_row),
         )
     ),
+    *(
+        Row("refine", fault, f"refine good.exr {command}", words)
+        for fault, command, words in (
+            ("nothing to refine by", "--to image.png -o new.exr", ("queries", "sampled BTF")),
+            ("no such data", "--to none.queries.zarr -o new.exr", ("none.queries.zarr",)),
+            ("no such loss", "--to good.btf.zarr -o new.exr --loss l1", ("--loss", "delta_e")),
+            ("too large a rate", "--to good.btf.zarr -o new.exr --rate 2", ("rate",)),
+            ("parameters of no scene", "--to good.btf.zarr -o new.exr -D spp=4", ("--scene",)),
+            ("its input", "--to good.btf.zarr -o good.exr", ("input",)),
+            ("no such map", "--to good.btf.zarr -o new.exr --maps cluster", ("cluster", "values")),
+        )
+    ),
+    Row("refine", "no representation", "refine good.btf.zarr --to good.btf.zarr -o new.exr", ("fit",)),
     Row("packages", "no such exporter", "export good.btf.zarr --format gone -o new", ("ubo", "utia", "bonn")),
     Row("ports", "a sampled BTF", f"{PORT.replace('.exr', '.btf.zarr')} new", ("good.btf.zarr",)),
     Row("ports", "a picture", f"{PORT.replace('good', 'image')} new", ("image.exr", "representation")),

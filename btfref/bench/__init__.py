@@ -16,10 +16,12 @@ SUITES = {
     "gbrdf": "btfref.bench.experiments.gbrdf",
     "lobes": "btfref.bench.experiments.lobes",
     "lod": "btfref.bench.experiments.lod",
+    "gradients": "btfref.bench.optimisation.gradients",
     "offgrid": "btfref.bench.experiments.offgrid",
     "proposals": "btfref.bench.experiments.proposals",
     "pyramid": "btfref.bench.experiments.pyramid",
     "queries": "btfref.bench.experiments.queries",
+    "refinement": "btfref.bench.optimisation.refinement",
     "reflectance": "btfref.bench.experiments.reflectance",
     "synth": "btfref.bench.synth",
 }

@@ -12,6 +12,7 @@ COMMANDS = (
     "import",
     "export",
     "fit",
+    "refine",
     "info",
     "view",
     "render",

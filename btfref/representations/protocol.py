@@ -154,6 +154,15 @@ class HasEntries(Protocol):
 
 
 @runtime_checkable
+class HasExponents(Protocol):
+    """Some channels of its maps are exponents of lobes: refinement moves them relative to their size."""
+
+    @property
+    def EXPONENTS(self) -> Mapping[str, tuple[int, int]]:  # noqa: N802 - a class attribute
+        """Map → (first, n): every n-th channel from the first one on."""
+
+
+@runtime_checkable
 class KeepsRows(Protocol):
     """Axes of some maps are rows of their images, so that they can be read alone."""
 

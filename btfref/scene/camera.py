@@ -30,6 +30,8 @@ def tell_camera(scene: JitArray, share: float) -> None:
     to_world = np.array(values["to_world"].matrix, float)
     angle = 2 * np.tan(np.radians(float(values["x_fov"][0])) / 2) / width * share
     parameters = mi.traverse(scene)
+    # An update computes all that is left: of maps that are not optimised, copies that nobody needs.
+    parameters.keep([r"(.*\.)?pixel_angle$", r"(.*\.)?camera$"])
     for key in [k for k in parameters.keys() if k.split(".")[-1] == "pixel_angle"]:
         if float(parameters[key][0]) == 0:
             parameters[key] = mi.Float(angle)

@@ -77,7 +77,7 @@ class ParabolicMaps:
         self.kind, self.values = dr.type_v(values.array), values.array
         if self.kind == dr.VarType.UInt32:
             self.values = mi.UInt32(self.values)
-        elif self.kind == dr.VarType.Float16 and not dr.grad_enabled(self.values):
+        elif self.kind == dr.VarType.Float16:
             self.kind = "halves"
         if self.kind == "halves" and np.abs(halves := values.numpy()).max(initial=0) <= HALF_LIMIT:
             # The shift keeps subnormal halves from being flushed (see HALF_SHIFT).

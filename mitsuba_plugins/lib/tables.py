@@ -65,6 +65,8 @@ class PairTable:
     Gathers dominate the cost, and their cost is the number of 32-bit words. Half tables are therefore kept as words
     of two values: on ring grids the same value of a light and of the next light on its ring, so that one entry feeds
     two of the four lights of a lookup; elsewhere two neighbouring values of an entry.
+
+    Gradients do not reach what a loop captures: where anything is differentiated by, the code is straight-line.
     """
 
     def __init__(self, values: JitArray, following: np.ndarray | None) -> None:
@@ -72,11 +74,10 @@ class PairTable:
         self.update(values)
 
     def update(self, values: JitArray) -> None:
-        """Take new values; differentiable ones are kept as they are, so that gradients reach them."""
+        """Take new values; halves are packed."""
         self.outer, self.n_views, self.n_lights, self.width = values.shape
         self.words, self.values = None, None
-        packable = dr.type_v(values.array) == dr.VarType.Float16 and not dr.grad_enabled(values.array)
-        halves = values.numpy() if packable else None
+        halves = values.numpy() if dr.type_v(values.array) == dr.VarType.Float16 else None
         # Moved bits make a number of NaN, which stands for what is not there: such tables stay as they are.
         if halves is None or not np.abs(halves).max() <= HALF_LIMIT:
             self.values = as_float32(values)
@@ -89,6 +90,11 @@ class PairTable:
             words |= halves
         self.words = dr.reinterpret_array(mi.Float, to_device(mi.UInt32, words))
         dr.eval(self.words)
+
+    @property
+    def differentiated(self) -> bool:
+        """Whether gradients by the values are being recorded."""
+        return self.values is not None and dr.grad_enabled(self.values)
 
     def combine(
         self,
@@ -123,7 +129,8 @@ class PairTable:
         outer = outer * self.n_views
         pairs = [pair for neighbour in views for pair in neighbour.single()]
         total = mi.Color3f(0) if total is None else total
-        if self.words is None or self.width <= UNROLLED_WIDTH:
+        weights = pairs, [light.single() for light in lights]
+        if self.width <= UNROLLED_WIDTH or self.differentiated or dr.grad_enabled(coefficients, weights):
             for view, weight in pairs:
                 total = self._add_view(total, outer + view, weight, lights, coefficients, active)
             return total

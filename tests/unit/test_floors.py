@@ -20,6 +20,7 @@ btfref.report
 btfref.validate
 btfref.stress
 btfref
+btfref.refining
 btfref.rendering
 btfref.scene
 btfref.datasets

@@ -11,7 +11,7 @@ A lobe is stored as coefficients in [−1, 1], exponent and peak, instead of as 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -60,6 +60,8 @@ class Representation(light_functions.AnalyticMaps):
     """``lobes`` [row, column, 4 k]: coefficients and exponent of each lobe; ``peaks`` [row, column, k];
     ``colour`` [row, column, 4]: chroma and ρ_d in 1/sr; and the direction tables.
     """  # noqa: D205
+
+    EXPONENTS: ClassVar = {"lobes": (3, 4)}
 
     @classmethod
     def schema(cls, meta: Facts, names: Collection[str]) -> Schema:

@@ -49,6 +49,7 @@ class Representation(light_functions.AnalyticMaps):
 
     #: Maps by view; see :mod:`btfref.representations.file.resident`.
     DIRECTION_AXES: ClassVar = {"view": {"factor": 2}}
+    EXPONENTS: ClassVar = {"lobes": (3, 4)}
 
     @classmethod
     def schema(cls, meta: Facts, names: Collection[str]) -> Schema:

@@ -84,6 +84,7 @@ class Representation(light_functions.AnalyticMaps):
     #: Maps by view; see :mod:`btfref.representations.file.resident`.
     DIRECTION_AXES: ClassVar = {"view": {"lobes": 2}}
     ROWS_BY: ClassVar = {"lobes": (2,)}
+    EXPONENTS: ClassVar = {"lobes": (2, 4)}
 
     @classmethod
     def schema(cls, meta: Facts, names: Collection[str]) -> Schema:

@@ -1,17 +1,13 @@
 """The plugin ``btf`` inside Mitsuba: registration, parameters, gradients, two sides, transforms."""
 
-import inspect
-
 import numpy as np
 import pytest
-from oracle import oracle_btf
 from probes import hemisphere, probe_points
 
 from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
 from btfref.numerics.device_arrays import to_device
-from btfref.registry import method, methods
-from btfref.representations import load, save
+from btfref.representations import load
 from btfref.stress.evaluators import surface
 
 
@@ -106,56 +102,6 @@ def test_twosided_mirrors(fits, llvm, load_plugin, rng):
     np.testing.assert_array_equal(value(mi, both, uv, a, b), value(mi, plugin, uv, a, b))
     below = [1, 1, -1]
     np.testing.assert_array_equal(value(mi, both, uv, a * below, b * below), value(mi, plugin, uv, a, b))
-
-
-@pytest.mark.parametrize("key", methods())
-def test_maps_are_differentiable(key, llvm, rng, tmp_path):
-    """The gradient of the mean value with respect to a map equals the difference quotient along a random direction."""
-    import drjit as dr
-
-    import mitsuba_plugins
-
-    mi = llvm
-    # Maps of floats: halves would round both ends of the difference.
-    # Few components: the derivative's kernel takes a minute to compile with the usual number, and is no other code.
-    fit = method(key).fit
-    known = inspect.signature(fit).parameters
-    small = {"storage": "float", "components": 2, "hidden": 4, "passes": 1.0}
-    settings = {name: value for name, value in small.items() if name in known}
-    path = tmp_path / f"oracle.{key}.exr"
-    save(fit(oracle_btf((8, 6)), **settings), path)
-    plugin = mitsuba_plugins.load(path)
-    parameters = mi.traverse(plugin)
-    # The largest differentiable map.
-    name = max(
-        (n for n, p in parameters if isinstance(p, (mi.TensorXf, mi.TensorXf16))),
-        key=lambda n: len(parameters[n].array),
-    )
-    uv, w_light, w_view = rng.random((256, 2)), hemisphere(rng, 256), hemisphere(rng, 256)
-    si, wo = surface(mi, len(uv), uv.T, w_view.T), to_device(mi.Vector3f, w_light.T)
-    start = mi.TensorXf(parameters[name])
-    # Of one sign, so that contributions do not cancel.
-    step = mi.TensorXf(rng.random(start.shape).astype(np.float32))
-
-    def values(t):
-        parameters[name] = start + t * step
-        parameters.update()
-        return plugin.eval(mi.BSDFContext(), si, wo)
-
-    def mean(h):
-        """In float64: the difference of two means would show how float32 adds up."""
-        return np.array(values(dr.opaque(mi.Float, h)), float).mean()  # one kernel for all steps
-
-    t = mi.Float(0)
-    dr.enable_grad(t)
-    loss = dr.mean(dr.mean(values(t)))
-    dr.forward(t)
-    slope = dr.grad(loss)[0]
-    # Richardson's extrapolation of the central difference: some methods are not linear in their maps.
-    wide, narrow = ((mean(h) - mean(-h)) / (2 * h) for h in (0.006, 0.003))
-    difference = (4 * narrow - wide) / 3
-    assert abs(difference) >= tolerance("plugin.reaches.min_slope")  # the map does reach the value
-    assert abs(slope - difference) <= tolerance("plugin.gradient.max") * abs(difference)
 
 
 def test_renders_in_symbolic_mode(fits, llvm, load_plugin):
