@@ -13,6 +13,9 @@ from numpy.typing import ArrayLike
 #: How lookups between measured views are interpolated.
 INTERPOLATIONS = ("blended", "drawn")
 
+#: The smallest normal float32: some ports flush what is smaller to 0.
+LEAST = float(np.finfo(np.float32).tiny)
+
 
 def chosen(index: np.ndarray, weight: np.ndarray, draw: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """The drawn neighbour of a stencil, with the weight of all.
@@ -76,17 +79,18 @@ def of_lookups(uv: ArrayLike, w_view: ArrayLike) -> np.ndarray:
     uv : array_like, shape (..., 2)
     w_view : array_like, shape (..., 3)
         Local frame. Both are rounded to float32; their bits are hashed, so that a neighbouring number is another draw.
+        What is no normal number counts as 0, whose sign is lost.
 
     Returns
     -------
     ndarray of float64, shape (...)
     """
-    uv, w_view = (np.asarray(a, np.float32) for a in (uv, w_view))
-    uv, xy = np.broadcast_arrays(uv, w_view[..., :2])
-    return hashed(np.concatenate([uv, xy], -1).view(np.uint32))
+    uv, xy = np.broadcast_arrays(np.asarray(uv, np.float32), np.asarray(w_view, np.float32)[..., :2])
+    numbers = np.concatenate([uv, xy], -1)
+    return hashed(np.where(np.abs(numbers) >= LEAST, numbers, np.float32(0)).view(np.uint32))
 
 
-def of_pixels(height: int, width: int, frame: int) -> np.ndarray:
+def of_pixels(height: int, width: int, frame: int, seed: int = 0) -> np.ndarray:
     """The draws of a frame in real time, shape (height, width), row 0 at the top.
 
     Parameters
@@ -95,7 +99,8 @@ def of_pixels(height: int, width: int, frame: int) -> np.ndarray:
         Of the picture.
     frame : int
         Number of the frame, from 0.
+    seed : int
     """
     row, column = np.mgrid[:height, :width]
-    words = [column, row, np.full_like(row, frame), np.zeros_like(row)]
+    words = [column, row, np.full_like(row, frame), np.full_like(row, seed)]
     return hashed(np.stack(words, -1))

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from btfref.errors import InputError
+from btfref.numerics.draws import LEAST
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -41,7 +42,10 @@ def of_lookups(uv: JitArray, w_view: JitArray) -> JitArray:
         For lookups that gradients are wanted of: what is drawn does not change with them.
     """
     refuse_gradients((uv, w_view))
-    a, b, c, d = (dr.reinterpret_array(mi.UInt32, mi.Float(x)) for x in (uv.x, uv.y, w_view.x, w_view.y))
+    numbers = (mi.Float(x) for x in (uv.x, uv.y, w_view.x, w_view.y))
+    # A comparison with NaN is false.
+    numbers = (dr.select(dr.abs(x) >= LEAST, x, 0) for x in numbers)
+    a, b, c, d = (dr.reinterpret_array(mi.UInt32, x) for x in numbers)
     a, b, c, d = (x * 1664525 + 1013904223 for x in (a, b, c, d))
     for last in (False, True):
         a = a + b * d

@@ -74,6 +74,9 @@ class RingInterpolation:
         high = np.minimum(low + 1, last)
         step = table[high, 0] - table[low, 0]
         t = np.clip((theta - table[low, 0]) / np.where(step > 0, step, 1), 0, 1)
+        if draw is not None:
+            # Beyond the last ring its samples are there twice: the lower ones have all of it, as in the ports.
+            t = np.where(step > 0, t, 0)
         indices, weights = [], []
         for ring, share in ((low, 1 - t), (high, t)):
             count = table[ring, 2]
