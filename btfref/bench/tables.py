@@ -206,6 +206,10 @@ def _new_kernels(facts: Facts | None) -> str:
     return f"{found[0]} compiled, {found[1]} from disk: {facts['codegen_s'] + facts['backend_s']:.2g} s"
 
 
+def _if_there(row: Facts, name: str) -> str:
+    return f"{row[name]:.2f}" if name in row else "–"
+
+
 _NAME = {
     "material": lambda r: r["material"],
     "entry": lambda r: r["entry"],
@@ -246,6 +250,10 @@ _COLUMNS = {
         "kernels, new": lambda r: _new_kernels(r["kernels"]),
         "ratio": lambda r: _span(r["ratio"]),
         "noise after 1 s": lambda r: f"{100 * r['noise_at_1s']:.2f} %",
+        "over blended: time": lambda r: _span(r["time_ratio"]) if "time_ratio" in r else "–",
+        "variance": lambda r: _if_there(r, "variance_ratio"),
+        "efficiency": lambda r: _if_there(r, "efficiency"),
+        "error after equal time": lambda r: _if_there(r, "equal_time_error"),
     },
     "sampling": {
         **_QUERY,
@@ -258,6 +266,8 @@ _COLUMNS = {
         "size": lambda r: r["size"],
         "milliseconds": lambda r: _span({**r["time"], **_scaled(r["time"], 1e3)}),
         "cold": lambda r: f"{1e3 * r['cold_s']:.3g}",
+        "noise of a frame": lambda r: f"{100 * r['noise']:.2f} %" if "noise" in r else "–",
+        "noise after 1 s": lambda r: f"{100 * r['noise_at_1s']:.2f} %" if "noise" in r else "–",
     },
 }
 

@@ -24,8 +24,8 @@ uniform bool two_sided;
 uniform vec3 emission;      // radiance of the shape's own light
 uniform int pass;           // number of this picture among those that add up
 #ifdef DRAWN_VIEWS
-uniform int frame;          // number of this frame, and the seed of all: with the pixel they draw
-uniform int seed;
+uniform uint frame;         // number of this frame, and the seed of all: with the pixel they draw
+uniform uint seed;
 #endif
 #ifdef HAS_ENVIRONMENT
 uniform int environment_passes;  // that the environment takes part in
