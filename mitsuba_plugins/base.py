@@ -293,9 +293,9 @@ def make_bsdf() -> type:
                 self.detail.traverse(callback)
 
         def parameters_changed(self, keys: list[str]) -> None:
-            # A moved camera changes no map. Without keys anything may have changed.
             if self.draws:
                 refuse_gradients((self.scale, *self.maps.tensors.values()))
+            # A moved camera changes no map. Without keys anything may have changed.
             if not keys or any(key in self.maps.tensors for key in keys):
                 self.evaluator.update(self.maps)
 
