@@ -168,6 +168,7 @@ def few_samplers(folder, patch):
 
 PORT = "export good.exr --format gl -o"
 
+
 def interpolating(way):
     """The scene's BTF interpolates in some way."""
 

@@ -146,7 +146,7 @@ class Entries:
 
 
 @runtime_checkable
-class DrawsViews(Representation, Protocol):
+class DrawsViews(Protocol):
     """It interpolates tables over views, of which one can be drawn instead: so can its ports.
 
     In Dr.Jit ``evaluate`` and ``proposal`` then take ``draw`` too, and in GLSL views come from ``view_stencil``.

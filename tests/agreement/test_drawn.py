@@ -19,7 +19,7 @@ from btfref.rendering.gl.realtime import realtime
 from btfref.rendering.offline.approximate import approximate
 from btfref.rendering.offline.reference import render
 from btfref.representations import load
-from btfref.representations.protocol import DrawsViews, HasLevels
+from btfref.representations.protocol import DrawsViews, HasLevels, direction_axes
 from btfref.scene.pixel_classes import pixel_classes
 from btfref.scene.shipped import scene_file
 from btfref.stress.evaluators import surface
@@ -45,6 +45,12 @@ def plugin_values(mi, plugin, uv, w_light, w_view, draw, **further):
         at, light, view, mi.Bool(True), draw=to_device(mi.Float, draw), **further
     )
     return np.array(dr.select(mi.Bool(True), value, 0)).T
+
+
+def test_methods_with_tables_over_views_draw():
+    """All whose maps have an axis over views, and no others."""
+    rows = methods().items()
+    assert [key for key, row in rows if direction_axes(row.representation, "view")] == DRAWING
 
 
 @pytest.mark.parametrize(("key", "kind"), CASES)
