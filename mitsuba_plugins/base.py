@@ -14,9 +14,12 @@ import numpy as np
 
 from btfref.conventions import FILTER_TYPES
 from btfref.errors import InputError
+from btfref.numerics.draws import INTERPOLATIONS
 from btfref.numerics.footprint import MODES
 from btfref.numerics.sphere.frames import uv_transform
 from btfref.registry import method
+from btfref.representations.protocol import DrawsViews
+from mitsuba_plugins.lib.draws import of_lookups, refuse_gradients
 from mitsuba_plugins.lib.footprint import LevelOfDetail
 from mitsuba_plugins.lib.frame import hand_of
 from mitsuba_plugins.lib.guide import LightGuide
@@ -43,27 +46,30 @@ def make_bsdf() -> type:
     class BTF(mi.BSDF):
         """A compressed BTF.
 
-        ========== ========= ==================================================================================
-        parameter  type      meaning
-        ========== ========= ==================================================================================
-        filename   string    the representation, as written by ``btfref fit``
-        filter_type string   "bilinear" or "nearest"; default: what the file says
-        scale      float     factor of the reflectance, ≥ 0; default 1
-        to_uv      transform of the texture coordinates; its rotation, or reflection, is that of the local frame too
-        sampling   string    what proposes light directions: "data", tables of the data; "lobes", the method's own lobes
-                             or microfacets; "both", half of each; "cosine", for comparison. Default: what has the least
-                             variance for its time, "data" for a method without lobes
-        views      string    indices of the measured views to keep, such as "0 3 17"; default: all. A lookup that needs
-                             another one gives no number
-        lights     string    likewise of the lights
-        entries    string    likewise of the entries that texels name: clusters, materials
-        levels     string    likewise of the levels of detail
-        lod        string    level of detail: "auto" (default), by the pixel's footprint; "distance", log2 of it; "none"
-        lod_bias   float     added to the level of detail, so that "none" with a bias is a fixed level; default 0
-        lod_unit   float     distance whose level of detail is 0 in mode "distance", > 0; default 1
-        pixel_angle float    that a pixel subtends in radians, for "auto"; default 0: not known, finest level
-        camera     point     from where distances count; default: the origin of each ray
-        ========== ========= ==================================================================================
+        ============= ========= ===================================================================================
+        parameter     type      meaning
+        ============= ========= ===================================================================================
+        filename      string    the representation, as written by ``btfref fit``
+        filter_type   string    "bilinear" or "nearest"; default: what the file says
+        interpolation string    "blended" (default), all measured views around the view; "drawn", one of them in each
+                                lookup, and its table of light directions: cheaper, the same on average, with more noise
+        scale         float     factor of the reflectance, ≥ 0; default 1
+        to_uv         transform of the texture coordinates; its rotation, or reflection, is that of the local frame too
+        sampling      string    what proposes light directions: "data", tables of the data; "lobes", the method's own
+                                lobes or microfacets; "both", half of each; "cosine", for comparison. Default: what has
+                                the least variance for its time, "data" for a method without lobes
+        views         string    indices of the measured views to keep, such as "0 3 17"; default: all. A lookup that
+                                needs another one gives no number
+        lights        string    likewise of the lights
+        entries       string    likewise of the entries that texels name: clusters, materials
+        levels        string    likewise of the levels of detail
+        lod           string    level of detail: "auto" (default), by the pixel's footprint; "distance", log2 of it;
+                                "none"
+        lod_bias      float     added to the level of detail, so that "none" with a bias is a fixed level; default 0
+        lod_unit      float     distance whose level of detail is 0 in mode "distance", > 0; default 1
+        pixel_angle   float     that a pixel subtends in radians, for "auto"; default 0: not known, finest level
+        camera        point     from where distances count; default: the origin of each ray
+        ============= ========= ===================================================================================
 
         ``mi.traverse`` offers ``scale`` and the maps that can be differentiated, in float32 whatever their type in the
         file; :func:`mitsuba_plugins.representation_of` makes a representation of them again. Integer maps and codes of
@@ -91,6 +97,8 @@ def make_bsdf() -> type:
             affine, self.turn = uv_transform(_matrix(_parameter(props, "to_uv", None)))
             # Python floats: NumPy scalars would try to read a symbolic operand.
             self.affine = affine.tolist()
+            self.draws = _choice(props, "interpolation", INTERPOLATIONS[0], INTERPOLATIONS) == "drawn"
+            self.draws_views = isinstance(representation, DrawsViews)
             self.key = representation.meta["method"]
             self.maps = Maps(representation, self.filter_type)
             self.evaluator = method(self.key).evaluator(self.maps)
@@ -168,7 +176,9 @@ def make_bsdf() -> type:
             others stay at ``uv``.
             """
             uv = self._uv(si)
-            known = {} if self.detail is None else self.detail(si)
+            known = self._known(si, uv, w_view)
+            # The same for both: a guide that knows nothing of the drawn view would cost variance.
+            draw = of_lookups(uv, w_view) if self.draws else None
             place = uv
             if isinstance(self.evaluator, Displaced):
                 hit, place = self.evaluator.hit(uv, w_view, active)
@@ -177,8 +187,13 @@ def make_bsdf() -> type:
                 own = self.evaluator.proposal(uv, w_view, active, **known)
                 if self.own_share == 1:
                     return known, own
-            guided = Guided(self.guide, self.guide.neighbours(place, w_view, known.get("lod")))
+            guided = Guided(self.guide, self.guide.neighbours(place, w_view, known.get("lod"), draw))
             return known, guided if self.own_share <= 0 else Mixture(own, guided, self.own_share)
+
+        def _known(self, si: JitArray, uv: JitArray, w_view: JitArray) -> dict[str, Any]:
+            """Arguments of the evaluator that do not depend on the light."""
+            known = {} if self.detail is None else self.detail(si)
+            return known | ({"draw": of_lookups(uv, w_view)} if self.draws and self.draws_views else {})
 
         def _value(
             self,
@@ -192,9 +207,10 @@ def make_bsdf() -> type:
             if ctx.mode == mi.TransportMode.Importance:
                 # The view's hit is of no use where the roles are swapped.
                 w_view, w_light, known = w_light, w_view, None
+            uv = self._uv(si)
             if known is None:
-                known = {} if self.detail is None else self.detail(si)
-            value = self.evaluator.evaluate(self._uv(si), w_light, w_view, active, **known)
+                known = self._known(si, uv, w_view)
+            value = self.evaluator.evaluate(uv, w_light, w_view, active, **known)
             return dr.select(active, value * self.scale, 0)
 
         def _directions(
@@ -257,7 +273,10 @@ def make_bsdf() -> type:
 
         def parameters_changed(self, keys: list[str]) -> None:
             # A moved camera changes no map.
-            if self.maps.take_over(keys):
+            changed = self.maps.take_over(keys)
+            if self.draws:
+                refuse_gradients((self.scale, *self.maps.tensors.values()))
+            if changed:
                 self.evaluator.update(self.maps)
 
         def representation(self) -> Representation:

@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 
 from btfref.numerics.powers import FLOOR
-from mitsuba_plugins.lib.analytic import held, packet, safe_power, single
-from mitsuba_plugins.lib.lookup import texel_stencil
+from mitsuba_plugins.lib.analytic import held, packet, safe_power
+from mitsuba_plugins.lib.lookup import single, texel_stencil
 from mitsuba_plugins.lib.port import Port
 from mitsuba_plugins.lib.proposals import CosineLobes
 
@@ -52,12 +52,14 @@ class Evaluator(Port):
             )
         return total
 
-    def evaluate(self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray) -> JitArray:
+    def evaluate(
+        self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray, draw: JitArray = None
+    ) -> JitArray:
         """B in 1/sr for valid directions; never negative."""
         light, fade = held(w_light, self.constants["light_edge"])
         v, _ = held(w_view, self.constants["view_edge"])
         product = light * v
-        views = self.views.stencil(w_view)
+        views = self.views.stencil(w_view, draw=draw)
         total = mi.Color3f(0)
         for texel, share in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True):
             red, green, blue, value = packet(self.colour, texel, 4, active)
@@ -70,7 +72,9 @@ class Evaluator(Port):
             total += value * mi.Color3f(red, green, blue)
         return total * (fade * light.z)
 
-    def proposal(self, uv: JitArray, w_view: JitArray, active: JitArray) -> CosineLobes:
+    def proposal(
+        self, uv: JitArray, w_view: JitArray, active: JitArray, draw: JitArray = None
+    ) -> CosineLobes:
         """The lobes of the nearest texel for the view, and its diffuse part; a common factor does not matter."""
         v, _ = held(w_view, self.constants["view_edge"])
         (texel,), _ = texel_stencil(uv, self.shape, "nearest")

@@ -113,12 +113,14 @@ class Evaluator(Port):
         lod: JitArray = 0.0,
         step: JitArray = None,
         ratio: JitArray = None,
+        draw: JitArray = None,
     ) -> JitArray:
         """B in 1/sr for valid directions, or its mean along a footprint; may be slightly negative.
 
         See :class:`mitsuba_plugins.lib.footprint.LevelOfDetail` for ``lod``, ``step`` and ``ratio``.
         """
-        views, lights = self.views.stencil(w_view), self.lights.stencil(w_light, hold=False)
+        views = self.views.stencil(w_view, draw=None if self.nearest else draw)
+        lights = self.lights.stencil(w_light, hold=False)
         if self.nearest:
             views, lights = _heaviest(views), _heaviest(lights)
         # A value that is no number fails the comparison.

@@ -37,9 +37,11 @@ class Evaluator(Port):
         weights = read_packets(self.weights, texel, self.width, active)[: self.constants["n_components"]]
         return cluster, [mi.Float(share), *(mi.Float(w) * share for w in weights)]
 
-    def evaluate(self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray) -> JitArray:
+    def evaluate(
+        self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray, draw: JitArray = None
+    ) -> JitArray:
         """B in 1/sr for valid directions; may be slightly negative."""
-        views, lights = self.views.stencil(w_view), self.lights.stencil(w_light, hold=False)
+        views, lights = self.views.stencil(w_view, draw=draw), self.lights.stencil(w_light, hold=False)
         texels = [
             self._texel(texel, share, active)
             for texel, share in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True)

@@ -35,8 +35,9 @@ class Evaluator(Protocol):
             Unit vectors of the upper hemisphere, in the texture's frame.
         active : Bool
         **known
-            ``lod``, ``step`` and ``ratio`` of a :class:`LevelledEvaluator`; ``hit`` of a :class:`Displaced` one. All
-            may be missing; others are given none of them.
+            ``lod``, ``step`` and ``ratio`` of a :class:`LevelledEvaluator`; ``hit`` of a :class:`Displaced` one;
+            ``draw`` of a method that is :class:`btfref.representations.protocol.DrawsViews`. All may be missing; others
+            are given none of them.
 
         Returns
         -------

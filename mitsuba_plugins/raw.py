@@ -25,9 +25,11 @@ class Evaluator(Port):
         table = type(values)(values.array, (rows * columns, n_views, n_lights, width))
         self.values = PairTable(table, self.lights.following())
 
-    def evaluate(self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray) -> JitArray:
+    def evaluate(
+        self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray, draw: JitArray = None
+    ) -> JitArray:
         """B in 1/sr for valid directions."""
-        views, lights = self.views.stencil(w_view), self.lights.stencil(w_light, hold=False)
+        views, lights = self.views.stencil(w_view, draw=draw), self.lights.stencil(w_light, hold=False)
         total = mi.Color3f(0)
         for texel, weight in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True):
             # Texels without weight are not fetched: they may not be there.

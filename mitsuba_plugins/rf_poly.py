@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_plugins.lib.analytic import held, packet, single
-from mitsuba_plugins.lib.lookup import texel_stencil
+from mitsuba_plugins.lib.analytic import held, packet
+from mitsuba_plugins.lib.lookup import single, texel_stencil
 from mitsuba_plugins.lib.port import Port
 
 if TYPE_CHECKING:
@@ -26,11 +26,13 @@ class Evaluator(Port):
         self.chroma = mi.Float(maps.tensors["chroma"].array)
         dr.eval(self.polynomial, self.chroma)
 
-    def evaluate(self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray) -> JitArray:
+    def evaluate(
+        self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray, draw: JitArray = None
+    ) -> JitArray:
         """B in 1/sr for valid directions; may be negative."""
         light, fade = held(w_light, self.constants["light_edge"])
         terms = [light.x * light.x, light.y * light.y, light.x * light.y, light.x, light.y, light.z * light.z]
-        views = single(self.views.stencil(w_view))
+        views = single(self.views.stencil(w_view, draw=draw))
         total = mi.Color3f(0)
         for texel, share in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True):
             value = mi.Float(0)

@@ -25,7 +25,9 @@ class Evaluator(Port):
         self.basis = PairTable(type(basis)(basis.array, (1, *basis.shape)), self.lights.following())
         self.weights, self.width = as_float32(weights), weights.shape[-1]
 
-    def evaluate(self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray) -> JitArray:
+    def evaluate(
+        self, uv: JitArray, w_light: JitArray, w_view: JitArray, active: JitArray, draw: JitArray = None
+    ) -> JitArray:
         """B in 1/sr for valid directions; may be slightly negative."""
         coefficient = [mi.Float(0)] * self.width
         for texel, share in zip(*texel_stencil(uv, self.shape, self.filter_type), strict=True):
@@ -33,7 +35,7 @@ class Evaluator(Port):
                 coefficient[k] = dr.fma(mi.Float(value), share, coefficient[k])
         return self.basis.combine(
             mi.UInt32(0),
-            self.views.stencil(w_view),
+            self.views.stencil(w_view, draw=draw),
             self.lights.stencil(w_light, hold=False),
             coefficient[: self.constants["n_components"]],
             active,

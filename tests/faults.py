@@ -194,6 +194,18 @@ def few_samplers(folder, patch):
 
 PORT = "export good.exr --format gl -o"
 
+
+def interpolating(way):
+    """The scene's BTF interpolates in some way."""
+
+    def prepare(folder, patch):
+        scene, line = folder / "good.xml", '<string name="filename" value="$btf"/>'
+        further = f'{line}<string name="interpolation" value="{way}"/>'
+        scene.write_text(scene.read_text().replace(line, further))
+
+    return prepare
+
+
 RENDER, REALTIME = "render good.xml -o out.exr --grid 1", "realtime good.xml -o out.exr"
 
 ROWS = [
@@ -356,6 +368,11 @@ ROWS = [
             ("compare image.exr good.xml --size 100000x100000", "at most"),
         )
     ),
+    Row("draws", "a noise-free picture", f"{RENDER} --interpolation drawn", ("--grid",)),
+    Row("draws", "the same by the scene", RENDER, ("good.xml", "drawn"), prepare=interpolating("drawn")),
+    Row("draws", "a word of the scene", REALTIME, ("blended or drawn",), prepare=interpolating("linear")),
+    Row("draws", "frames that are all alike", f"{REALTIME} --frames 16", ("interpolation drawn",)),
+    Row("draws", "a part of the grid", f"{REALTIME} --interpolation drawn --frames 10", ("multiple of 16",)),
     # 6
     Row(
         "memory",

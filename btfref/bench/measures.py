@@ -305,7 +305,10 @@ def measure_realtime(entry: Entry, path: PathLike, plan: Plan) -> Iterator[Facts
     Yields
     ------
     dict
+        ``variance`` is the mean over the pixels of the squared noise of one frame, by half the squared difference of
+        two, ``mean`` that of the radiance.
     """
+    from btfref.rendering.frames import interpolated
     from btfref.rendering.gl.renderer import Renderer
     from btfref.scene.description import read_scene
     from btfref.scene.shipped import scene_file
@@ -316,10 +319,19 @@ def measure_realtime(entry: Entry, path: PathLike, plan: Plan) -> Iterator[Facts
             if "filter_type" in query:
                 parameters["filter"] = query["filter_type"]
             scene = read_scene(scene_file("cloth"), parameters, size=tuple(size))
-            with Renderer(scene) as renderer:
+            with Renderer(interpolated(scene, query.get("interpolation"))) as renderer:
                 cold = 1e-3 * renderer.draw()
-                times = [1e-3 * renderer.draw() for _ in range(plan.rounds["realtime"] + 1)][1:]
-            yield {"query": query, "size": list(size), "cold_s": cold, "warm_s": times}
+                one = renderer.read()
+                times = [1e-3 * renderer.draw(frame=k) for k in range(1, plan.rounds["realtime"] + 2)][1:]
+                other = renderer.read()
+            yield {
+                "query": query,
+                "size": list(size),
+                "cold_s": cold,
+                "warm_s": times,
+                "variance": float(((one - other) ** 2).mean() / 2),
+                "mean": float(one.mean()),
+            }
 
 
 def saved(built: Built, entry: Entry, folder: PathLike) -> Path | None:

@@ -186,6 +186,7 @@ def rows(folder: PathLike, records: list[Facts] | None = None) -> list[Facts]:
         for r in records
         if r["record"] == "sampling" and r["way"] == "cosine"
     }
+    blended = {_drawn_key(r): r for r in records if r.get("query", {}).get("interpolation") == "blended"}
     baselines = {r["id"]: r["plan"]["baseline"] for r in records if r["record"] == "run"}
     builds = {}
     for r in records:
@@ -224,6 +225,8 @@ def rows(folder: PathLike, records: list[Facts] | None = None) -> list[Facts]:
             row["ratio"] = paired_ratio(r, base)
             # The noise of a picture that is given one second: variance falls with samples, samples grow with time.
             row["noise_at_1s"] = float(np.sqrt(r["variance"] * row["time"]["median"]) / r["mean"])
+            if r.get("query", {}).get("interpolation") == "drawn" and _drawn_key(r) in blended:
+                row |= over_blended(r, blended[_drawn_key(r)])
         elif kind == "sampling":
             if r["way"] != "data":
                 continue
@@ -238,5 +241,41 @@ def rows(folder: PathLike, records: list[Facts] | None = None) -> list[Facts]:
                 "cold_s": r["cold_s"],
                 "time": time_of(r),
             }
+            if "variance" in r:
+                row["noise"] = float(np.sqrt(r["variance"]) / r["mean"])
+                row["noise_at_1s"] = row["noise"] * float(np.sqrt(row["time"]["median"]))
         result.append(row)
     return result
+
+
+def _drawn_key(record: Facts) -> tuple[object, ...]:
+    """What a record with drawn interpolation and its twin with blended one have in common."""
+    query = {name: value for name, value in record.get("query", {}).items() if name != "interpolation"}
+    names = ("record", "run", "material", "entry", "scene")
+    return *(str(record.get(name)) for name in names), str(query)
+
+
+def over_blended(record: Facts, blended: Facts) -> Facts:
+    """A picture with drawn interpolation against the same with blended one.
+
+    Parameters
+    ----------
+    record, blended : dict
+        Of kind "render". Their rounds took turns with a baseline each, and are compared as ratios to it.
+
+    Returns
+    -------
+    dict
+        ``variance_ratio``; ``time_ratio``, a spread; ``efficiency``, 1 / (variance · time) over that of the other, and
+        ``equal_time_error``, the standard deviation over the other's after the same time.
+    """
+    shares = [[a / b for a, b in zip(r["warm_s"], r["baseline_s"], strict=False)] for r in (record, blended)]
+    times = spread([a / b for a, b in zip(*shares, strict=False)])
+    variance = record["variance"] / blended["variance"] if blended["variance"] else 1.0
+    product = max(variance * times["median"], 1e-30)
+    return {
+        "variance_ratio": variance,
+        "time_ratio": times,
+        "efficiency": 1 / product,
+        "equal_time_error": float(np.sqrt(product)),
+    }

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import tomllib
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,9 @@ SUFFIX = ".toml"
 
 #: What can be measured, in the order in which it is.
 MEASURES = ("build", "off_grid", "error", "eval", "render", "sampling", "realtime")
+
+#: Those that "interpolation" among query parameters says something to, or nothing does.
+PICTURES = ("build", "error", "render", "realtime")
 
 #: Tables and keys of a plan with their defaults.
 DATA = {
@@ -155,6 +158,9 @@ def read_plan(path: PathLike, *, quick: bool = False, only: Iterable[str] | None
         }
     measures = found.get("measures", list(MEASURES))
     _known(measures, MEASURES, path, "measures")
+    if any("interpolation" in query for query in _queries(found)):
+        # The others ask for one value, not for a picture.
+        _known(measures, PICTURES, path, "measures with query.interpolation")
     tables = {}
     for name, defaults in (("data", DATA), ("rounds", ROUNDS), ("settings", SETTINGS)):
         _known(found.get(name, {}), defaults, path, name)
@@ -201,9 +207,15 @@ def _entries(found: Facts, path: PathLike) -> list[Entry]:
     return entries
 
 
+def _queries(found: Facts) -> Iterator[Facts]:
+    """Tables of query parameters: that of the plan and those of its methods."""
+    yield found.get("query", {})
+    yield from (row.get("query", {}) for row in found.get("method", []))
+
+
 def _combinations(table: Facts, path: PathLike) -> tuple[Facts, ...]:
     """All combinations of lists of query parameters."""
-    _known(table, ("filter_type",), path, "query")
+    _known(table, ("filter_type", "interpolation"), path, "query")
     lists = [value if isinstance(value, list) else [value] for value in table.values()]
     return tuple(dict(zip(table, values, strict=True)) for values in itertools.product(*lists))
 

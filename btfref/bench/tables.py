@@ -213,6 +213,10 @@ def _off_grid(number: int) -> Callable[[Facts], str]:
     return lambda r: off_grid.cells(r)[number]
 
 
+def _if_there(row: Facts, name: str) -> str:
+    return f"{row[name]:.2f}" if name in row else "–"
+
+
 _NAME = {
     "material": lambda r: r["material"],
     "entry": lambda r: r["entry"],
@@ -258,6 +262,10 @@ _COLUMNS = {
         "kernels, new": lambda r: _new_kernels(r["kernels"]),
         "ratio": lambda r: _span(r["ratio"]),
         "noise after 1 s": lambda r: f"{100 * r['noise_at_1s']:.2f} %",
+        "over blended: time": lambda r: _span(r["time_ratio"]) if "time_ratio" in r else "–",
+        "variance": lambda r: _if_there(r, "variance_ratio"),
+        "efficiency": lambda r: _if_there(r, "efficiency"),
+        "error after equal time": lambda r: _if_there(r, "equal_time_error"),
     },
     "sampling": {
         **_QUERY,
@@ -270,6 +278,8 @@ _COLUMNS = {
         "size": lambda r: r["size"],
         "milliseconds": lambda r: _span({**r["time"], **_scaled(r["time"], 1e3)}),
         "cold": lambda r: f"{1e3 * r['cold_s']:.3g}",
+        "noise of a frame": lambda r: f"{100 * r['noise']:.2f} %" if "noise" in r else "–",
+        "noise after 1 s": lambda r: f"{100 * r['noise_at_1s']:.2f} %" if "noise" in r else "–",
     },
 }
 

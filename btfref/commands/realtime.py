@@ -2,7 +2,7 @@
 
 Meshes, spheres, disks and cylinders with BTFs or other materials (diffuse exactly, the rest as their mean albedo), a
 perspective camera, directional, point, spot and area lights, and an envmap, sunsky or constant emitter. The image is
-the mean of a regular sub-pixel grid (--grid).
+the mean of a regular sub-pixel grid (--grid); with --interpolation drawn of as many frames of it as --frames says.
 
 All lights but environments cast shadows, as in `btfref render --grid`, where a shape can be in the way: always, unless
 all shapes lie in one plane. A scene with an environment is drawn without, since an environment's light casts none here
@@ -24,15 +24,17 @@ from btfref.commands.shared.images import write_images
 from btfref.commands.shared.options import (
     add_grid,
     add_image,
+    add_interpolation,
     add_json,
     add_keep,
     add_scene,
+    add_seed,
     add_shadows,
     help_with_scenes,
 )
 from btfref.commands.shared.printing import Progress, emit, emit_json, say_area_lights
 from btfref.commands.shared.reading import assignments, count, output_file
-from btfref.errors import DIRECTIONS, InputError
+from btfref.errors import DIRECTIONS, SAMPLES, InputError
 from btfref.rendering.environment_light import PATHS
 
 if TYPE_CHECKING:
@@ -69,6 +71,17 @@ def add_arguments(parser: ArgumentParser) -> None:
         metavar="KEY=VALUE",
         help="clusters, components, shadows (0 or 1), bounces, bits (8 or 32) and map_size of the transfer",
     )
+    add_interpolation(
+        parser,
+        "all neighbours, or one that each pixel and frame draws: cheaper, with noise (default: the scene's)",
+    )
+    parser.add_argument(
+        "--frames",
+        type=count(1, SAMPLES),
+        metavar="N",
+        help="that are averaged where views are drawn: a multiple of those of --grid (default: once these)",
+    )
+    add_seed(parser)
     add_json(parser, "frame time and OpenGL renderer")
 
 
@@ -115,6 +128,9 @@ def run(args: Namespace) -> int:
             window=args.window,
             transfer=transfer_settings(args.transfer) if args.transfer else None,
             shadows=args.shadows,
+            interpolation=args.interpolation,
+            frames=args.frames,
+            seed=args.seed,
             progress=progress,
         )
     facts = picture_facts(result, args.scene, parameters=parameters, size=args.size)

@@ -15,6 +15,7 @@ from btfref.commands.shared.images import write_images
 from btfref.commands.shared.options import (
     add_grid,
     add_image,
+    add_interpolation,
     add_keep,
     add_scene,
     add_seed,
@@ -41,6 +42,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     add_grid(parser, default=None, text="direct light on a regular grid of N × N sub-pixels")
     add_shadows(parser, "cast shadows, or direct light without (default: with)")
     add_keep(parser)
+    add_interpolation(
+        parser,
+        "all neighbours, or one that each lookup draws: cheaper, with more noise (default: the scene's)",
+    )
     parser.add_argument("--debug", action="store_true", help="a channel that is no number is an error")
     parser.add_argument("--geometry", action="store_true", help="path trace the mesostructure itself")
     parser.add_argument("--classes", metavar="C.png", help="also write the pixel classes (for compare)")
@@ -60,6 +65,9 @@ def run(args: Namespace) -> int:
     parameters = assignments(args.define, convert=str, option="-D")
     if args.geometry and args.grid is not None:
         raise InputError("geometry is path traced", field="--geometry", got="--grid")
+    if args.interpolation == "drawn" and (args.geometry or args.grid is not None):
+        other = "--geometry" if args.geometry else "--grid"
+        raise InputError("only pictures of random samples draw views", field="--interpolation", got=other)
     classes_out = output_file(args.classes, ".png") if args.classes else None
 
     if args.geometry:
@@ -79,6 +87,7 @@ def run(args: Namespace) -> int:
             shadows=args.shadows,
             keep=args.keep,
             debug=args.debug,
+            interpolation=args.interpolation,
         )
     if lost := result.meta.get("not_finite"):
         emit(f"{lost} channels are no numbers: lookups outside of what the file holds, or broken materials")

@@ -23,7 +23,7 @@ ALWAYS = ("renderer", "grid", "spp", "seed", "shadows")
 #: The same, where there is some.
 SOMETIMES = (
     *("variant", "integrator", "rounds", "batches", "max_depth", "mesostructure", "estimated_error"),
-    *("area_light_points", "area_light_error"),
+    *("area_light_points", "area_light_error", "interpolation", "frames"),
     *("environment_path", "environment_lights", "order", "window", "gl_vendor", "gl_renderer", "gl_version"),
 )
 

@@ -90,6 +90,7 @@ def evaluate_tabulated(
     w_light: ArrayLike,
     w_view: ArrayLike,
     *,
+    draw: ArrayLike | None = None,
     gathered: int = 1,
 ) -> np.ndarray:
     """Evaluate a method that interpolates tables over measured directions and texels.
@@ -101,6 +102,8 @@ def evaluate_tabulated(
     kernel : callable
         ``Stencils -> (N, 3)`` float64.
     uv, w_light, w_view : array_like, shape (..., 2), (..., 3), (..., 3)
+    draw : array_like, shape (...), optional
+        See :meth:`btfref.representations.protocol.DrawsViews.evaluate`.
     gathered : int
         Values that the kernel gathers for a lookup: with many, fewer are done at a time.
 
@@ -111,13 +114,18 @@ def evaluate_tabulated(
     arrays, meta = representation.arrays(), representation.meta
     views, lights = interpolation.from_arrays(arrays, "view"), interpolation.from_arrays(arrays, "light")
 
-    def lookup(uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray) -> np.ndarray:
+    def lookup(uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray, *draws: np.ndarray) -> np.ndarray:
         texel, texel_weight = conventions.texel_stencil(uv, meta["texels"], meta["filter_type"])
-        view, view_weight = views.stencil(w_view)
+        view, view_weight = views.stencil(w_view, draw=draws[0] if draws else None)
         light, light_weight = lights.stencil(w_light, hold=False)
         return kernel(Stencils(texel, texel_weight, view, view_weight, light, light_weight))
 
-    return evaluate_points(lookup, uv, w_light, w_view, gathered=gathered)
+    return evaluate_points(lookup, uv, w_light, w_view, *given(draw), gathered=gathered)
+
+
+def given(draw: ArrayLike | None) -> tuple[ArrayLike, ...]:
+    """A draw as a further argument of each lookup of :func:`evaluate_points`; nothing where there is none."""
+    return () if draw is None else (draw,)
 
 
 def evaluate_points(

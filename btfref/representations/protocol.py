@@ -145,6 +145,41 @@ class Entries:
 
 
 @runtime_checkable
+class DrawsViews(Protocol):
+    """It interpolates tables over views, of which one can be drawn instead: so can its ports.
+
+    In Dr.Jit ``evaluate`` and ``proposal`` then take ``draw`` too, and in GLSL views come from ``view_stencil``.
+    """
+
+    @property
+    def DRAWS_VIEWS(self) -> bool:  # noqa: N802 - a class attribute
+        """True."""
+
+    def evaluate(
+        self,
+        uv: ArrayLike,
+        w_light: ArrayLike,
+        w_view: ArrayLike,
+        *,
+        lod: ArrayLike = 0.0,
+        draw: ArrayLike | None = None,
+    ) -> np.ndarray:
+        """As :meth:`Representation.evaluate`, with one measured view instead of all neighbours.
+
+        Parameters
+        ----------
+        uv, w_light, w_view, lod : array_like
+        draw : array_like, shape (...), optional
+            In [0, 1): the view is drawn by it with the interpolation's weights, as
+            :func:`btfref.numerics.draws.chosen` says. The mean over uniform draws is the value without.
+
+        Returns
+        -------
+        ndarray of float64, shape (..., 3)
+        """
+
+
+@runtime_checkable
 class HasEntries(Protocol):
     """Its texels name entries of codebooks (clusters, materials), so that some can be read and kept alone."""
 

@@ -32,7 +32,8 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
     ``plain`` loads the shapes alone: materials become diffuse, and BTF files need not exist. ``kept`` says which
     maps are loaded: file to the materials' parameters ``views``, ``lights``, ``entries`` and ``levels``. Without
     ``sampled`` nobody draws light directions, and materials are spared the tables for it; None: where all lights are
-    delta lights.
+    delta lights. ``interpolation`` is that of all materials in place of the scene's; one that is "drawn" is refused
+    but where ``draws`` says that the picture is a mean of random samples.
     """
 
     def __init__(
@@ -45,8 +46,11 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
         plain: bool = False,
         kept: Kept | None = None,
         sampled: bool | None = True,
+        interpolation: str | None = None,
+        draws: bool = False,
     ) -> None:
         self._arguments = scene, parameters, variant, size, plain, kept, sampled
+        self._interpolation, self._draws = interpolation, draws
         self._before = None
         self._uncollected = no_collection()
 
@@ -82,6 +86,7 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
                     continue
                 if not sampled:
                     node.props["sampling"] = "cosine"
+                self._interpolate(parsed, node)
                 if kept:
                     for name, chosen in kept[node.props["filename"]].items():
                         if chosen is not None:
@@ -96,6 +101,19 @@ class loaded:  # noqa: N801 - a context manager that reads as a verb
         except BaseException:
             self.__exit__()
             raise
+
+    def _interpolate(self, parsed: ParsedScene, node: JitArray) -> None:
+        """Set how a material interpolates, and refuse draws that no further sample would average."""
+        if self._interpolation is not None:
+            node.props["interpolation"] = self._interpolation
+        if parsing.interpolation_of(parsed, node) == "drawn" and not self._draws:
+            raise InputError(
+                "only pictures of random samples draw views",
+                file=parsed.location(node),
+                field="interpolation",
+                got="drawn",
+                expected="blended",
+            )
 
     def __exit__(self, *_: object) -> None:
         self._uncollected.__exit__(None, None, None)

@@ -15,6 +15,7 @@ from types import ModuleType
 import numpy as np
 
 from btfref.errors import InputError, refuse_large_picture
+from btfref.numerics.draws import INTERPOLATIONS
 from btfref.numerics.footprint import MODES
 from btfref.numerics.sphere.frames import uv_transform
 from btfref.platform import set_variant
@@ -23,7 +24,7 @@ from btfref.scene.parameters import check_parameters, search_paths
 from btfref.scene.reading.instances import without_merges
 from btfref.scene.shapes import BtfMaterial
 from btfref.scene.shipped import ENVIRONMENTS, scene_file
-from btfref.types import JitArray, SceneLike
+from btfref.types import Facts, JitArray, SceneLike
 from mitsuba_plugins.lib.parameters import refuse_unknown
 
 #: Emitters that shine on each point from one direction, and those infinitely far away on all sides: one at most.
@@ -314,6 +315,26 @@ def _shipped_environment(parsed: ParsedScene, node: JitArray, name: str) -> None
     node.props["bitmap"] = mi.Bitmap(np.ascontiguousarray(shipped(name).radiance))
 
 
+def interpolation_of(parsed: ParsedScene, node: JitArray) -> str:
+    """How a ``btf`` material interpolates between measured views.
+
+    Raises
+    ------
+    InputError
+        For a way that there is not.
+    """
+    found = node.props["interpolation"] if "interpolation" in node.props else INTERPOLATIONS[0]
+    if found not in INTERPOLATIONS:
+        raise InputError(
+            "unknown interpolation",
+            file=parsed.location(node),
+            field="interpolation",
+            got=found,
+            expected=" or ".join(INTERPOLATIONS),
+        )
+    return str(found)
+
+
 def material_of(parsed: ParsedScene, shape: JitArray) -> tuple[str, BtfMaterial | None]:
     """Plugin name of the shape's BSDF, and the BTF material if it is one.
 
@@ -359,7 +380,7 @@ def material_of(parsed: ParsedScene, shape: JitArray) -> tuple[str, BtfMaterial 
         )
     matrix = np.eye(4) if "to_uv" not in props else np.array(props["to_uv"].matrix, float)
     affine, _ = uv_transform(matrix, file=parsed.location(node))
-    numbers = {name: float(props[name]) for name in ("scale", "lod_bias", "lod_unit") if name in props}
+    numbers: Facts = {name: float(props[name]) for name in ("scale", "lod_bias", "lod_unit") if name in props}
     mode = str(props["lod"]) if "lod" in props else "auto"
     if mode not in MODES:
         where, expected = parsed.location(node), " or ".join(MODES)
@@ -369,7 +390,8 @@ def material_of(parsed: ParsedScene, shape: JitArray) -> tuple[str, BtfMaterial 
         raise InputError(
             "the lod_unit is out of range", file=where, field="lod_unit", got=got, expected="> 0"
         )
+    numbers |= {"lod": mode, "interpolation": interpolation_of(parsed, node)}
     material = BtfMaterial(
-        props["filename"], filter_type, numbers.pop("scale", 1.0), affine, twosided, lod=mode, **numbers
+        props["filename"], filter_type, numbers.pop("scale", 1.0), affine, twosided, **numbers
     )
     return plugin, material

@@ -103,7 +103,9 @@ def pixel_classes(
     ndarray of uint8, shape (H, W)
         Codes of `PixelClass`.
     """
-    with loaded(scene, parameters, variant=variant, size=size, sampled=False) as made:
+    with loaded(
+        scene, parameters, variant=variant, size=size, sampled=False, interpolation="blended"
+    ) as made:
         shape, point, normal, front, footprint, ambiguous = _hits(
             made, grid, ROUNDING if follows_rays else np.inf
         )

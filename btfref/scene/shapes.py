@@ -45,6 +45,8 @@ class BtfMaterial:
         How the level of detail is chosen, for methods with levels.
     lod_bias, lod_unit : float
         Added to it; distance at which it is 0 in mode "distance".
+    interpolation : {"blended", "drawn"}
+        Between measured views.
     """
 
     filename: str
@@ -55,6 +57,7 @@ class BtfMaterial:
     lod: str = "auto"
     lod_bias: float = 0.0
     lod_unit: float = 1.0
+    interpolation: str = "blended"
 
     #: Real time shows it as it is.
     exact: ClassVar[bool] = True

@@ -14,7 +14,6 @@ from btfref.numerics.powers import FLOOR, LIMIT_LOG2, LOWEST_LOG2
 
 if TYPE_CHECKING:
     from btfref.types import JitArray
-    from mitsuba_plugins.lib.lookup import Neighbour
 
 
 #: Below this |f|, log2(1 + f) comes from a series in f / (2 + f): 1 + f would round what a large exponent multiplies.
@@ -76,11 +75,6 @@ def parabolic_axis(s: JitArray, t: JitArray) -> JitArray:
     r2 = dr.fma(s, s, t * t)
     scale = 1 / (1 + r2)
     return mi.Vector3f(2 * s * scale, 2 * t * scale, (1 - r2) * scale)
-
-
-def single(neighbours: list[Neighbour]) -> list[tuple[JitArray, JitArray]]:
-    """Samples of a stencil one by one: a list of (index, weight)."""
-    return [pair for neighbour in neighbours for pair in neighbour.single()]
 
 
 def packet(table: JitArray, entry: JitArray, width: int, active: JitArray = True) -> list[JitArray]:

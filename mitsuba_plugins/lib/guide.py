@@ -17,6 +17,7 @@ import numpy as np
 from btfref.numerics.device_arrays import to_device
 from btfref.numerics.sphere import interpolation
 from btfref.representations.protocol import HasLevels
+from mitsuba_plugins.lib.lookup import single, texel_stencil
 
 if TYPE_CHECKING:
     from btfref.numerics.sphere.interpolation import Interpolation
@@ -207,8 +208,6 @@ class LightGuide:
         """Index of the tables of the group of the texel, of the level nearest to ``lod`` where there are levels."""
         if self.single_group:
             return mi.UInt32(0)
-        from mitsuba_plugins.lib.lookup import texel_stencil
-
         if lod is None or len(self.shapes) == 1:
             (texel,), _ = texel_stencil(uv, self.shapes[0], "nearest")
         else:
@@ -219,17 +218,13 @@ class LightGuide:
         return dr.gather(mi.UInt32, self.group, texel) * self.n_views
 
     def neighbours(
-        self, uv: JitArray, w_view: JitArray, lod: JitArray = None
+        self, uv: JitArray, w_view: JitArray, lod: JitArray = None, draw: JitArray = None
     ) -> list[tuple[JitArray, JitArray]]:
-        """Tables that the view direction blends, as a list of (table, weight); weights sum to 1."""
+        """Tables that the view direction blends, or draws, as a list of (table, weight); weights sum to 1."""
         if self.uniform:
             return [(mi.UInt32(0), mi.Float(1))]
         first = self._first_table(uv, lod)
-        return [
-            (first + view, weight)
-            for neighbour in self.views.stencil(w_view)
-            for view, weight in neighbour.single()
-        ]
+        return [(first + view, weight) for view, weight in single(self.views.stencil(w_view, draw=draw))]
 
     def pdf(
         self, neighbours: list[tuple[JitArray, JitArray]], w_light: JitArray, active: JitArray

@@ -14,6 +14,7 @@ import numpy as np
 from btfref.conventions import LEAST_Z, SQUARED_LENGTHS
 from btfref.numerics.device_arrays import to_device
 from btfref.numerics.sphere.interpolation import MISSING
+from mitsuba_plugins.lib.draws import chosen
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -125,6 +126,16 @@ class Neighbour:
         return pairs
 
 
+def single(neighbours: list[Neighbour]) -> list[tuple[JitArray, JitArray]]:
+    """Samples of a stencil one by one: a list of (index, weight)."""
+    return [pair for neighbour in neighbours for pair in neighbour.single()]
+
+
+def drawn(neighbours: list[Neighbour], draw: JitArray, *, hold: bool) -> list[Neighbour]:
+    """A stencil, or the one sample of it that is drawn, with the weight of all."""
+    return neighbours if draw is None else [Neighbour(*chosen(single(neighbours), draw, hold=hold))]
+
+
 class RingTable:
     """Port of :class:`btfref.numerics.sphere.interpolation.RingInterpolation`."""
 
@@ -138,8 +149,8 @@ class RingTable:
             result += [first + (i + 1) % count for i in range(count)]
         return np.array(result)
 
-    def stencil(self, w: JitArray, *, hold: bool = True) -> list[Neighbour]:
-        """List of :class:`Neighbour`: one on the lower and one on the upper ring."""
+    def stencil(self, w: JitArray, *, hold: bool = True, draw: JitArray = None) -> list[Neighbour]:
+        """List of :class:`Neighbour`: one on the lower and one on the upper ring; the drawn one alone with ``draw``."""
         polar = angle_of(dr.sqrt(dr.fma(w.x, w.x, w.y * w.y)), w.z)
         theta = dr.fma(polar[0], QUARTER_PI[0], polar[1])
         eighths, rest = angle_of(w.y, w.x)
@@ -194,8 +205,8 @@ class RingTable:
                 cap = self._across_the_cap(first, fraction, inset)
         if self.rings[0, 0] > 0:
             inside = theta < float(self.rings[0, 0])
-            neighbours = [_chosen(inside, *pair) for pair in zip(cap, neighbours, strict=True)]
-        return neighbours
+            neighbours = [_selected(inside, *pair) for pair in zip(cap, neighbours, strict=True)]
+        return drawn(neighbours, draw, hold=hold)
 
     def _across_the_cap(
         self, first: JitArray, fraction: JitArray, inset: JitArray
@@ -235,7 +246,7 @@ class RingTable:
         )
 
 
-def _chosen(mask: JitArray, one: Neighbour, other: Neighbour) -> Neighbour:
+def _selected(mask: JitArray, one: Neighbour, other: Neighbour) -> Neighbour:
     """One neighbour where a mask holds, else another."""
     (a, b), (c, d) = one.single(), other.single()
     return Neighbour(*(dr.select(mask, x, y) for x, y in zip((*a, *b), (*c, *d), strict=True)))
@@ -264,8 +275,8 @@ class TriangleTable:
         n_a, n_b, n_c = (mi.Vector3f(row[i : i + 3]) for i in (6, 9, 12))
         return dr.dot(n_a, from_b), dr.dot(n_b, from_a), dr.dot(n_c, from_a)
 
-    def stencil(self, w: JitArray, *, hold: bool = True) -> list[Neighbour]:
-        """List of three :class:`Neighbour` without followers."""
+    def stencil(self, w: JitArray, *, hold: bool = True, draw: JitArray = None) -> list[Neighbour]:
+        """List of three :class:`Neighbour` without followers; the drawn one alone with ``draw``."""
         w = mi.Vector3f(dr.detach(w))
         s = w.x / (1 + w.z)
         t = w.y / (1 + w.z)
@@ -302,7 +313,7 @@ class TriangleTable:
             fade = dr.minimum(dr.maximum(w.z, 0) / dr.maximum(cos_edge, 1e-6), 1)
             weights = [x * dr.select(beyond, fade, 1) for x in weights]
         indices = [mi.UInt32(dr.maximum(x, 0)) for x in data[15:18]]
-        return [Neighbour(i, x) for i, x in zip(indices, weights, strict=True)]
+        return drawn([Neighbour(i, x) for i, x in zip(indices, weights, strict=True)], draw, hold=hold)
 
 
 class ResidentTable:
@@ -322,8 +333,8 @@ class ResidentTable:
         after = self._table[following[kept]]
         return np.where(after == MISSING, self._table[kept], after).astype(np.int64)
 
-    def stencil(self, w: JitArray, *, hold: bool = True) -> list[Neighbour]:
-        """As the table's own, in slots."""
+    def stencil(self, w: JitArray, *, hold: bool = True, draw: JitArray = None) -> list[Neighbour]:
+        """As the table's own, in slots; a drawn lookup needs only what it draws."""
 
         def kept(index: JitArray, weight: JitArray) -> tuple[JitArray, JitArray]:
             slot = dr.gather(mi.UInt32, self.slots, index)
@@ -331,7 +342,7 @@ class ResidentTable:
             return dr.select(absent, 0, slot), dr.select(absent & (weight > 0), dr.nan, weight)
 
         result = []
-        for neighbour in self.inner.stencil(w, hold=hold):
+        for neighbour in self.inner.stencil(w, hold=hold, draw=draw):
             pairs = [kept(*pair) for pair in neighbour.single()]
             if len(pairs) == 2 and not hold:
                 # Packed tables reach the second light through the first one: without it there is no number either.

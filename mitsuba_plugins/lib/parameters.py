@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 PARAMETERS = (
     "filename",
     "filter_type",
+    "interpolation",
     "scale",
     "to_uv",
     "sampling",

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from btfref.numerics.device_arrays import to_device
+from mitsuba_plugins.lib.lookup import single
 
 if TYPE_CHECKING:
     from btfref.types import JitArray
@@ -127,10 +128,11 @@ class PairTable:
             # Applied first: unscaled halves times small weights would underflow.
             coefficients = [c * HALF_SCALE for c in coefficients]
         outer = outer * self.n_views
-        pairs = [pair for neighbour in views for pair in neighbour.single()]
+        pairs = single(views)
         total = mi.Color3f(0) if total is None else total
         weights = pairs, [light.single() for light in lights]
-        if self.width <= UNROLLED_WIDTH or self.differentiated or dr.grad_enabled(coefficients, weights):
+        straight = self.differentiated or dr.grad_enabled(coefficients, weights)
+        if straight or self.width <= UNROLLED_WIDTH or len(pairs) == 1:
             for view, weight in pairs:
                 total = self._add_view(total, outer + view, weight, lights, coefficients, active)
             return total

@@ -23,6 +23,10 @@ uniform float scale;
 uniform bool two_sided;
 uniform vec3 emission;      // radiance of the shape's own light
 uniform int pass;           // number of this picture among those that add up
+#ifdef DRAWN_VIEWS
+uniform uint frame;         // number of this frame, and the seed of all: with the pixel they draw
+uniform uint seed;
+#endif
 #ifdef HAS_ENVIRONMENT
 uniform int environment_passes;  // that the environment takes part in
 #endif
@@ -68,6 +72,10 @@ void main() {
     float side = two_sided && w_view.z < 0.0 ? -1.0 : 1.0;
     w_view.z *= side;
     float lod = lod_of(point, uv_row0, uv_row1, -direction, distance(point.position, camera_origin));
+#ifdef DRAWN_VIEWS
+    // One for all lights, so that the passes of a frame draw alike; rows count from the top, as in files.
+    view_draw = hashed(uvec4(gl_FragCoord.x, film_height - gl_FragCoord.y, frame, seed));
+#endif
 #ifdef COUNT_FETCHES
     fetches = 0;  // of the geometry
 #endif

@@ -1,6 +1,11 @@
 // Provides btf_eval of a Laplacian pyramid: the mean and the levels from floor(lod) on; finer ones are not fetched.
 // Expects basis [level, view, light, component], weights [texels of all levels, component], mean or phong.
 
+// The nearest view is one already.
+#if NEAREST_DIRECTIONS
+#define NEAREST_VIEW
+#endif
+
 #include "lib/numbers/split_sum.glsl"
 #include "lib/lookup/directions.glsl"
 #include "lib/surface/footprint.glsl"

@@ -24,18 +24,26 @@ SAMPLES, MANY_SAMPLES = 250_000, 1_000_000
 #: Methods that propose directions by lobes or microfacets of their own: a test holds that these are all.
 OWN = ("rf_lobes", "lafortune", "lafortune_lut", "gbrdf")
 
-#: Method, directions, and what samples: each method's default, the shared tables alone, and lobes alone.
+#: Method, directions, and what samples: each method's default, the shared tables alone, lobes alone, or a drawn table.
 CASES = [
     *((key, "ubo81", "") for key in methods()),
     ("lpca", "capped", ""),
     *((key, "ubo81", "lobes") for key in OWN),
+    ("lpca", "ubo81", "drawn"),
+]
+
+#: Drawn interpolation of methods with levels, with lobes of their own, with a geometry, and on other directions.
+MORE = [
+    *((key, "ubo81", "drawn") for key in ("laplacian", "rf_lobes", "gbrdf")),
+    ("lpca", "scattered", "drawn"),
 ]
 
 
-@pytest.fixture(params=CASES, ids="-".join)
+@pytest.fixture(params=[*CASES, *(pytest.param(c, marks=pytest.mark.long) for c in MORE)], ids="-".join)
 def case(request, fits):
     key, kind, sampling = request.param
-    return fits.path(key, kind), {"sampling": sampling} if sampling else {}
+    name = "interpolation" if sampling == "drawn" else "sampling"
+    return fits.path(key, kind), {name: sampling} if sampling else {}
 
 
 def test_these_methods_have_lobes_of_their_own(llvm):
@@ -51,7 +59,7 @@ def test_these_methods_have_lobes_of_their_own(llvm):
 
 def assert_samples_follow_the_density(mi, bsdf, view, uvs, samples=SAMPLES):
     """χ² at each place; significance Šidák-corrected over all that may be made."""
-    n_tests = len(VIEWS) * len(UVS) * len(CASES)
+    n_tests = len(VIEWS) * len(UVS) * len([*CASES, *MORE])
     for uv in uvs:
         right, message = chi_square(mi, bsdf, uv, VIEWS[view], samples=samples, tests=n_tests)
         assert right, message

@@ -7,6 +7,7 @@ from argparse import ArgumentParser, BooleanOptionalAction, _ActionsContainer
 
 from btfref.commands.shared.reading import count, memory_size, size
 from btfref.errors import GRID, SEED, WORKERS
+from btfref.numerics.draws import INTERPOLATIONS
 from btfref.sampling.settings import DTYPES
 from btfref.scene.shipped import ENVIRONMENTS, described, lights, names
 
@@ -81,6 +82,11 @@ def add_keep(parser: _ActionsContainer) -> None:
 def add_shadows(parser: _ActionsContainer, text: str) -> None:
     """``--shadows`` and ``--no-shadows``; without either the command decides."""
     parser.add_argument("--shadows", action=BooleanOptionalAction, default=None, help=text)
+
+
+def add_interpolation(parser: _ActionsContainer, text: str) -> None:
+    """``--interpolation blended|drawn``; without it the scene decides."""
+    parser.add_argument("--interpolation", choices=INTERPOLATIONS, help=f"between measured views: {text}")
 
 
 def add_only(parser: _ActionsContainer) -> None:

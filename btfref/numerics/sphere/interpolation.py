@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from btfref.errors import InputError
+from btfref.numerics.draws import chosen
 from btfref.numerics.sphere.parabolic import hemisphere_to_square
 from btfref.precision import real
 
@@ -43,7 +44,9 @@ class RingInterpolation:
 
     size = 4
 
-    def stencil(self, w: ArrayLike, *, hold: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    def stencil(
+        self, w: ArrayLike, *, hold: bool = True, draw: ArrayLike | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Neighbouring samples of the directions ``w`` and their weights.
 
         Parameters
@@ -53,11 +56,13 @@ class RingInterpolation:
         hold : bool
             True (views): the last ring is held down to the horizon. False (lights): it is held and multiplied by
             cos θ / cos θ_last, so that the weights fall to zero at the horizon.
+        draw : array_like, shape (...), optional
+            In [0, 1): one neighbour is drawn, and has the weight of all (:func:`btfref.numerics.draws.chosen`).
 
         Returns
         -------
-        index : ndarray of int64, shape (..., 4)
-        weight : ndarray of float64, shape (..., 4)
+        index : ndarray of int64, shape (..., 4), or (..., 1) with ``draw``
+        weight : ndarray of float64, of the same shape
         """
         x, y, z = np.moveaxis(real(w), -1, 0)
         # acos(z) would lose half of the digits near the pole.
@@ -69,6 +74,9 @@ class RingInterpolation:
         high = np.minimum(low + 1, last)
         step = table[high, 0] - table[low, 0]
         t = np.clip((theta - table[low, 0]) / np.where(step > 0, step, 1), 0, 1)
+        if draw is not None:
+            # Beyond the last ring its samples are there twice: the lower ones have all of it, as in the ports.
+            t = np.where(step > 0, t, 0)
         indices, weights = [], []
         for ring, share in ((low, 1 - t), (high, t)):
             count = table[ring, 2]
@@ -91,7 +99,8 @@ class RingInterpolation:
             if np.cos(edge) > 1e-6:
                 fade = np.where(theta > edge, np.maximum(z, 0) / np.cos(edge), 1)
                 weight = weight * fade[..., None]
-        return index.astype(np.int64), weight
+        index = index.astype(np.int64)
+        return (index, weight) if draw is None else chosen(index, weight, draw)
 
     def arrays(self, prefix: str) -> dict[str, np.ndarray]:
         """The tables of the ports: ``{prefix}_rings``, float32 (n_rings, 4)."""
@@ -192,7 +201,9 @@ class TriangleInterpolation:
             current = np.where(outside, across, current)
         return current
 
-    def stencil(self, w: ArrayLike, *, hold: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    def stencil(
+        self, w: ArrayLike, *, hold: bool = True, draw: ArrayLike | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Neighbouring samples and weights, as :meth:`RingInterpolation.stencil`, with three samples."""
         w = real(w)
         row = real(self.triangles)[self.locate(w)]
@@ -206,7 +217,8 @@ class TriangleInterpolation:
             cos_edge = edge[..., 2] / np.where(length > 0, length, 1)
             fade = np.maximum(w[..., 2], 0) / np.maximum(cos_edge, 1e-6)
             weight = weight * np.where(beyond, np.minimum(fade, 1), 1)[..., None]
-        return np.maximum(row[..., 15:18], 0).astype(np.int64), weight
+        index = np.maximum(row[..., 15:18], 0).astype(np.int64)
+        return (index, weight) if draw is None else chosen(index, weight, draw)
 
     def arrays(self, prefix: str) -> dict[str, np.ndarray]:
         """The tables of the ports: ``{prefix}_triangles`` float32 and ``{prefix}_cells`` float32."""
@@ -310,15 +322,17 @@ class ResidentInterpolation:
     ) -> None:
         self.inner, self.slots, self.kind = inner, slots[:, 0].astype(np.int64), kind
 
-    def stencil(self, w: ArrayLike, *, hold: bool = True) -> tuple[np.ndarray, np.ndarray]:
-        """As the interpolation's own, in slots.
+    def stencil(
+        self, w: ArrayLike, *, hold: bool = True, draw: ArrayLike | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """As the interpolation's own, in slots; a drawn lookup needs only what it draws.
 
         Raises
         ------
         InputError
             When a sample with weight is not kept.
         """
-        index, weight = self.inner.stencil(w, hold=hold)
+        index, weight = self.inner.stencil(w, hold=hold, draw=draw)
         slot = self.slots[index]
         absent = slot == MISSING
         needed = absent & (weight > 0)

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from btfref.representations.protocol import Representation
 
 
+#: Numbers of a lookup without a draw.
+LOOKUP = 9
+
+
 def probe(
     rep: Representation,
     uv: ArrayLike,
@@ -24,6 +28,7 @@ def probe(
     lod: ArrayLike = 0.0,
     *,
     filter_type: str | None = None,
+    draw: ArrayLike | None = None,
 ) -> np.ndarray:
     """Values of ``rep`` computed by its shader.
 
@@ -37,6 +42,8 @@ def probe(
         Level of detail.
     filter_type : {"nearest", "bilinear"}, optional
         Overrides the file's texel filter.
+    draw : array_like, optional
+        See :meth:`btfref.representations.protocol.DrawsViews.evaluate`.
 
     Returns
     -------
@@ -48,7 +55,7 @@ def probe(
     MissingDependencyError
         Without an OpenGL driver.
     """
-    points, _ = broadcast_points(uv, w_light, w_view, lod)
+    points, _ = broadcast_points(uv, w_light, w_view, lod, *(() if draw is None else (draw,)))
     if not len(points):
         return np.zeros((0, 3), np.float32)
     with probe_points(rep, points, filter_type=filter_type) as made:
@@ -163,7 +170,8 @@ class PointProbe:
         # Without a bound framebuffer transform feedback on a surfaceless context returns zeros, without an error.
         self._target = self._own(self.ctx.simple_framebuffer((1, 1)))
         self._target.use()
-        self._program = self._own(tables.program(self.ctx, host, varyings=result[:1]))
+        defines = {"DRAWN_VIEWS": 1} if "draw" in names else {}
+        self._program = self._own(tables.program(self.ctx, host, varyings=result[:1], defines=defines))
         self._textures = tables.textures
         content, start = [], 0
         for name, width in names.items():
@@ -207,24 +215,24 @@ def probe_points(
     result: tuple[str, int] = ("value", 3),
 ) -> PointProbe:
     """A :class:`PointProbe` of ``rep`` at rows of :func:`broadcast_points`; the caller runs and releases it."""
-    names = {"uv": 2, "w_light": 3, "w_view": 3, "lod": 1}
+    names = {"uv": 2, "w_light": 3, "w_view": 3, "lod": 1} | ({"draw": 1} if points.shape[1] > LOOKUP else {})
     tables = device.ShaderRepresentation.upload(device.context(), rep, filter_type=filter_type)
     return PointProbe(tables, "hosts/probe.vert", names, points, result)
 
 
 def broadcast_points(
-    uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, lod: ArrayLike = 0.0
+    uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, lod: ArrayLike = 0.0, *draws: ArrayLike
 ) -> tuple[np.ndarray, tuple[int, ...]]:
-    """The arguments of ``evaluate`` as rows (uv, w_light, w_view, lod) of float32.
+    """The arguments of ``evaluate`` as rows (uv, w_light, w_view, lod, and the draw if there is one) of float32.
 
     Returns
     -------
-    points : ndarray of float32, shape (N, 9)
+    points : ndarray of float32, shape (N, 9), or (N, 10) with a draw
     shape : tuple of int
         The broadcast leading shape, with N items.
     """
     parts = [np.asarray(a, np.float32) for a in (uv, w_light, w_view)]
-    parts.append(np.asarray(lod, np.float32)[..., None])
+    parts += [np.asarray(a, np.float32)[..., None] for a in (lod, *draws)]
     shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
     columns = [np.broadcast_to(part, (*shape, part.shape[-1])).reshape(-1, part.shape[-1]) for part in parts]
     return np.concatenate(columns, -1), shape

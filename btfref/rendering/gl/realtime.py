@@ -15,6 +15,7 @@ from btfref import representations
 from btfref.errors import GRID, BtfrefError, InputError, refuse_above
 from btfref.rendering import RenderResult
 from btfref.rendering.environment_light.lighting import lighting_of
+from btfref.rendering.frames import interpolated, refuse_unknown, rounds_of
 from btfref.rendering.gl import device
 from btfref.rendering.gl.renderer import Renderer
 from btfref.scene.demand import MARGIN, kept_maps, number_kept
@@ -43,6 +44,9 @@ def realtime(
     transfer: TransferSettings | None = None,
     shadows: bool | None = None,
     count_fetches: bool = False,
+    interpolation: str | None = None,
+    frames: int | None = None,
+    seed: int = 0,
     progress: Progress | None = None,
 ) -> RenderResult:
     """Render a scene with OpenGL.
@@ -75,6 +79,14 @@ def realtime(
         but by the way "transfer".
     count_fetches : bool
         Count the texels that the representations fetch: ``meta["fetches"]``, the mean over covered samples.
+    interpolation : {"blended", "drawn"}, optional
+        Of all BTFs between measured views, in place of the scene's: all neighbours of a lookup, or one, drawn for each
+        pixel and frame by a hash of their numbers (:func:`btfref.numerics.draws.of_pixels`), for all lights alike.
+    frames : int, optional
+        Frames that are averaged where views are drawn: the regular grid again and again, a multiple of n². By default
+        once. Two rounds or more give ``variance``, that of the mean.
+    seed : int
+        Of the draws.
     progress : callable, optional
         ``progress(done, total, label)``, after each frame.
 
@@ -88,8 +100,9 @@ def realtime(
         ``gl_renderer``, ``gl_version``; ``negative_fraction``, the share of channels below zero, and ``not_finite``,
         their number: nothing is clamped; ``kept``, how many maps were kept by file; ``shadows``, and with them
         ``shadow_maps``, the number of maps, ``shadow_traced``, that of the lights without one, and ``shadow_ms``, the
-        time to draw maps, once for all frames. With an environment ``environment_path``, the way taken, and what it
-        says of itself, such as ``environment_lights`` and their ``estimated_error``; by file where there are several.
+        time to draw maps, once for all frames; where views are drawn ``interpolation``, ``frames`` and ``seed``. With
+        an environment ``environment_path``, the way taken, and what it says of itself, such as ``environment_lights``
+        and their ``estimated_error``; by file where there are several.
 
     Raises
     ------
@@ -102,12 +115,16 @@ def realtime(
     if grid < 1:
         raise InputError("the sub-pixel grid needs a sample", field="grid", got=grid, expected="≥ 1")
     refuse_above(GRID, grid, "grid")
+    refuse_unknown(interpolation)
     if keep != "all" and isinstance(scene, SceneDescription):
         raise InputError("the maps that are needed follow from a scene file", field="keep", got=keep)
     needed: Kept = {}
     if not isinstance(scene, SceneDescription):
         file, scene = scene, read_scene(scene, parameters, size=size)
         needed = kept_maps(keep, file, parameters, description=scene, grid=grid, size=size, margin=MARGIN)
+
+    scene = interpolated(scene, interpolation)
+    rounds = rounds_of(scene, grid, frames)
 
     def load_needed(path: str) -> Representation:
         return representations.load(path, **needed[path])
@@ -119,19 +136,28 @@ def realtime(
     given: dict[str, Any] = {"lighting": lighting, "shadows": shadows, "count_fetches": count_fetches}
     with Renderer(scene, load_file, **given) as renderer:
         offsets = [((i + 0.5) / grid, (j + 0.5) / grid) for j in range(grid) for i in range(grid)]
-        total = np.zeros((scene.camera.height, scene.camera.width, 3))
+        shape = scene.camera.height, scene.camera.width, 3
+        mean, squares = np.zeros(shape), np.zeros(shape)
         times, fetches = [], []
-        for number, offset in enumerate(offsets):
-            if progress:
-                progress(number, len(offsets), "frames")
-            times.append(renderer.draw(offset, share=1 / grid))
-            total += renderer.read()
-            if count_fetches:
-                fetches.append(renderer.fetches())
-        image = (total / len(offsets)).astype(np.float32)
+        for done in range(rounds):
+            total = np.zeros(shape)
+            for number, offset in enumerate(offsets, done * len(offsets)):
+                if progress:
+                    progress(number, rounds * len(offsets), "frames")
+                times.append(renderer.draw(offset, share=1 / grid, frame=number, seed=seed))
+                total += renderer.read()
+                if count_fetches:
+                    fetches.append(renderer.fetches())
+            # Welford: rounds differ by little, sums of squares would lose it.
+            change = total / len(offsets) - mean
+            mean += change / (done + 1)
+            squares += change * (total / len(offsets) - mean)
+        image = mean.astype(np.float32)
+        variance = (squares / (rounds - 1) / rounds).astype(np.float32) if rounds > 1 else None
         meta = {
             "renderer": "realtime",
             "grid": grid,
+            **({"interpolation": "drawn", "frames": len(times), "seed": seed} if renderer.draws else {}),
             # Transfer carries the environment's own shadows.
             "shadows": shadows or bool(renderer.transfers and transfer is not None and transfer.shadows),
             **renderer.shadow_facts,
@@ -157,4 +183,4 @@ def realtime(
         raise BtfrefError(
             f"{meta['not_finite']} channels needed maps that were not kept; render with all maps"
         )
-    return RenderResult(image, None, meta)
+    return RenderResult(image, variance, meta)

@@ -25,6 +25,7 @@ from btfref.rendering.gl.raster import (
     world_to_clip,
 )
 from btfref.rendering.gl.shadows import TRACED, ShadowMaps
+from btfref.representations.protocol import DrawsViews
 from btfref.scene.description import SceneDescription
 from btfref.scene.surfaces.materials import PlainMaterial
 from btfref.types import Facts, JitArray
@@ -40,8 +41,9 @@ if TYPE_CHECKING:
 #: Gives the representation of a file.
 LoadFile = Callable[[str], "Representation"]
 
-#: Of what is shown: file or material, texel filter, the mesh where each has light of its own, whether on a quadric.
-Key = tuple["str | PlainMaterial", str | None, int | None, bool]
+#: Of what is shown: file or material, texel filter, interpolation between views, the mesh where each has light of its
+#: own, whether on a quadric.
+Key = tuple["str | PlainMaterial", str | None, str, int | None, bool]
 
 
 class Renderer:
@@ -98,6 +100,8 @@ class Renderer:
         self._hosts: dict[tuple[str, bool], tuple[JitArray, JitArray]] = {}
         self._seen: tuple[JitArray, JitArray] | None = None
         self._counting = {"COUNT_FETCHES": 1} if count_fetches else {}
+        #: Whether frames of different numbers differ.
+        self.draws = False
         try:
             for number, mesh in enumerate(scene.meshes):
                 self._add(number, mesh, load_file or representations.load)
@@ -123,7 +127,7 @@ class Renderer:
         # Matrices of transfer belong to triangles.
         exact = mesh.quadric is not None and own is None
         what = material if isinstance(material, PlainMaterial) else material.filename
-        key = (what, material.filter_type, own, exact)
+        key = (what, material.filter_type, material.interpolation, own, exact)
         if key not in self._shown:
             rep = what.representation if isinstance(what, PlainMaterial) else load_file(what)
             light = None
@@ -138,6 +142,9 @@ class Renderer:
             defines = {"N_LIGHTS": self._n_lights, **self._counting}
             if self._shadows is not None:
                 defines |= self._shadows.defines
+            if material.interpolation == "drawn" and isinstance(rep, DrawsViews):
+                defines["DRAWN_VIEWS"] = 1
+                self.draws = True
             by_pixel = len(self._passes(light, 1)) > 1 and (light is None or light.bins is None)
             if by_pixel:
                 defines["SEEN"] = 1
@@ -206,7 +213,9 @@ class Renderer:
         clip, planes = common["world_to_clip"].T, (self._near, self._far)
         return quadrics.quadric_uniforms(mesh.quadric, self.camera, clip, planes, adds=adds)
 
-    def draw(self, offset: tuple[float, float] = (0.5, 0.5), *, share: float = 1.0) -> float:
+    def draw(
+        self, offset: tuple[float, float] = (0.5, 0.5), *, share: float = 1.0, frame: int = 0, seed: int = 0
+    ) -> float:
         """Draw a frame.
 
         Parameters
@@ -215,6 +224,8 @@ class Renderer:
             The sample's place in each pixel, from the top left.
         share : float
             Side of a sample's footprint in pixels, for the level of detail.
+        frame, seed : int
+            What materials with drawn interpolation draw by, as :func:`btfref.numerics.draws.of_pixels` says.
 
         Returns
         -------
@@ -236,6 +247,8 @@ class Renderer:
             # gl_FragCoord is at pixel centres.
             "film_offset": np.asarray(offset, float) - 0.5,
             "film_height": float(camera.height),
+            "frame": frame,
+            "seed": seed,
             **(self._shadows.uniforms if self._shadows is not None else {}),
         }
         ctx.finish()

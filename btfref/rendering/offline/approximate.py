@@ -14,15 +14,17 @@ import numpy as np
 
 from btfref import representations
 from btfref.errors import InputError
+from btfref.numerics.draws import of_pixels
 from btfref.numerics.footprint import ANISOTROPY, probe_weight
 from btfref.rendering import RenderResult
 from btfref.rendering.environment_light.lighting import lighting_of
-from btfref.representations.protocol import HasLevels
+from btfref.rendering.frames import interpolated, rounds_of
+from btfref.representations.protocol import DrawsViews, HasLevels
 from btfref.scene.description import read_scene
 from btfref.scene.hits import Hits, surfaces
 from btfref.scene.loading import loaded
 from btfref.scene.reading.instances import drawn_shapes
-from btfref.types import SceneLike
+from btfref.types import Facts, SceneLike
 
 if TYPE_CHECKING:
     from btfref.rendering.environment_light.prepared import Prepared
@@ -40,6 +42,9 @@ def approximate(
     size: tuple[int, int] | None = None,
     load_file: Callable[[str], Representation] | None = None,
     pixels: np.ndarray | None = None,
+    interpolation: str | None = None,
+    frames: int | None = None,
+    seed: int = 0,
     **options: Any,
 ) -> RenderResult:
     """What :func:`btfref.rendering.gl.realtime.realtime` approximates, evaluated in float64.
@@ -59,6 +64,8 @@ def approximate(
         ``path -> Representation``; the default reads the files.
     pixels : ndarray of bool, shape (H, W), optional
         Those that are evaluated; the others stay black.
+    interpolation, frames, seed
+        As for ``realtime``: the same views are drawn, but under maps of an environment, where all are blended.
     **options
         ``lights``, ``order``, ``window`` and ``transfer`` as for ``realtime``.
 
@@ -76,7 +83,8 @@ def approximate(
     """
     if grid < 1:
         raise InputError("the sub-pixel grid needs a sample", field="grid", got=grid, expected="≥ 1")
-    description = read_scene(scene, parameters, size=size)
+    description = interpolated(read_scene(scene, parameters, size=size), interpolation)
+    rounds = rounds_of(description, grid, frames)
     if not description.lights and description.environment is None:
         raise InputError("the scene has no light", file=description.source, field="emitter")
     lighting = lighting_of(description, path, **options)
@@ -85,9 +93,10 @@ def approximate(
     wanted = np.full(len(total), True) if pixels is None else np.ravel(pixels)
     # A plain material is evaluated as a representation is.
     rep: Any
-    with loaded(scene, parameters, size=size, sampled=False) as made:
+    # Asked for hits alone, whatever their materials do.
+    with loaded(scene, parameters, size=size, sampled=False, interpolation="blended") as made:
         shapes = drawn_shapes(made, [mesh.where for mesh in description.meshes])
-        for surface in surfaces(made, grid):
+        for place, surface in enumerate(surfaces(made, grid)):
             for number, (mesh, drawn) in enumerate(zip(description.meshes, shapes, strict=True)):
                 seen = surface.sees(drawn) & wanted
                 # Mitsuba's area light shines on the side of the shading normal.
@@ -110,7 +119,13 @@ def approximate(
                     if key not in prepared:
                         prepared[key] = lighting.prepared(rep, file=name, mesh=number)
                     light = prepared[key]
-                value = _radiance(rep, hits, mesh, description, grid, light)
+                settings = rep, hits, mesh, description, grid, light
+                if mesh.btf.interpolation == "drawn" and isinstance(rep, DrawsViews):
+                    numbers = [place + k * grid**2 for k in range(rounds)]
+                    draws = [of_pixels(camera.height, camera.width, k, seed).ravel() for k in numbers]
+                    value = sum(_radiance(*settings, draw[hits.at]) for draw in draws) / rounds
+                else:
+                    value = _radiance(*settings)
                 total[hits.at] += mesh.btf.scale * value
     image = (total / grid**2).reshape(camera.height, camera.width, 3)
     facts = [{"environment_path": p.path, **p.facts} for p in prepared.values()]
@@ -144,15 +159,17 @@ def _radiance(
     description: SceneDescription,
     grid: int,
     prepared: Prepared | None,
+    draw: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Radiance towards the viewer without the material's factor, shape (N, 3)."""
+    """Radiance towards the viewer without the material's factor, shape (N, 3); by a draw for each hit if there are."""
     levels, camera = isinstance(representation, HasLevels), description.camera
     texels = representation.meta["texels"]
     footprint = hits.footprint(camera.origin, camera.pixel_angle / grid, texels) if levels else ()
 
     def evaluate(uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray, at: np.ndarray) -> np.ndarray:
+        drawn: Facts = {} if draw is None else {"draw": draw[at]}
         if not levels:
-            return representation.evaluate(uv, w_light, w_view)
+            return representation.evaluate(uv, w_light, w_view, **drawn)
         lod, step, ratio = (a[at] for a in footprint)
         value = np.zeros((len(uv), 3))
         reach = int((ANISOTROPY - 1) / 2)
@@ -160,8 +177,9 @@ def _radiance(
             share = probe_weight(j, ratio)
             some = np.flatnonzero(share > 0)
             if len(some):
+                further = {name: value[some] for name, value in {"lod": lod, **drawn}.items()}
                 found = representation.evaluate(
-                    uv[some] + j * step[some], w_light[some], w_view[some], lod=lod[some]
+                    uv[some] + j * step[some], w_light[some], w_view[some], **further
                 )
                 value[some] += share[some, None] * found
         return value

@@ -10,6 +10,7 @@ import numpy as np
 
 from btfref.errors import GRID, SAMPLES, BtfrefError, InputError, refuse_above
 from btfref.rendering import RenderResult
+from btfref.rendering.frames import refuse_unknown
 from btfref.rendering.offline.direct_light import make_integrator, on_grid
 from btfref.sampling.variant import no_collection
 from btfref.scene.camera import tell_camera
@@ -40,6 +41,7 @@ def render(
     with_variance: bool = False,
     keep: str = "all",
     debug: bool = False,
+    interpolation: str | None = None,
 ) -> RenderResult:
     """Render a scene with Mitsuba.
 
@@ -77,6 +79,9 @@ def render(
     debug : bool
         A channel that is no number is an error. ``meta["not_finite"]`` counts them in any case: lookups outside of what
         a file or ``keep`` holds give none.
+    interpolation : {"blended", "drawn"}, optional
+        Of all BTFs between measured views, in place of the scene's: all neighbours of a lookup, or one of them, drawn
+        anew in each, with its table of light directions. "drawn" is refused with ``grid``.
 
     Returns
     -------
@@ -104,7 +109,14 @@ def render(
     )
     # On a grid, materials under delta lights alone are only evaluated, unless random lights are asked for.
     sampled = True if grid is None or with_variance else None
-    with loaded(scene, parameters, variant=variant, size=size, kept=kept, sampled=sampled) as made:
+    refuse_unknown(interpolation)
+    settings: Facts = {
+        "kept": kept,
+        "sampled": sampled,
+        "interpolation": interpolation,
+        "draws": grid is None,
+    }
+    with loaded(scene, parameters, variant=variant, size=size, **settings) as made:
         if not made.emitters():
             file = None if isinstance(scene, dict) else scene
             raise InputError("the scene has no light", file=file, field="emitter")
@@ -113,6 +125,8 @@ def render(
         traces = there if grid is not None else shadows is not False
         found = traced(made, spp=spp, seed=seed, grid=grid, shadows=traces, with_variance=with_variance)
         found.meta["shadows"] = there
+        if interpolation is not None:
+            found.meta["interpolation"] = interpolation
         if not variant.startswith("scalar"):
             found.meta["mirrored"] = seen_mirrored(made)
     lost = found.meta["not_finite"]

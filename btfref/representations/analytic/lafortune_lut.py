@@ -50,6 +50,7 @@ class Representation(light_functions.AnalyticMaps):
     #: Maps by view; see :mod:`btfref.representations.file.resident`.
     DIRECTION_AXES: ClassVar = {"view": {"factor": 2}}
     EXPONENTS: ClassVar = {"lobes": (3, 4)}
+    DRAWS_VIEWS: ClassVar = True
 
     @classmethod
     def schema(cls, meta: Facts, names: Collection[str]) -> Schema:
@@ -57,9 +58,15 @@ class Representation(light_functions.AnalyticMaps):
         return lafortune.lobe_schema(factor=MapSchema("rows columns views", least=0, most=FACTOR_BOUND))
 
     def evaluate(
-        self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
+        self,
+        uv: ArrayLike,
+        w_light: ArrayLike,
+        w_view: ArrayLike,
+        *,
+        lod: ArrayLike = 0.0,
+        draw: ArrayLike | None = None,
     ) -> np.ndarray:
-        """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored. Never negative.
+        """See :meth:`btfref.representations.protocol.DrawsViews.evaluate`; ``lod`` is ignored. Never negative.
 
         The factor is interpolated over views as tables are; the lobes are evaluated at the view itself.
         """
@@ -72,7 +79,7 @@ class Representation(light_functions.AnalyticMaps):
             value = factor * lafortune.texel_values(maps, s)
             return np.einsum("nt,ntc,nt->nc", s.texel_weight, maps["colour"][s.texel, :3], value)
 
-        return light_functions.evaluate_analytic(self, kernel, uv, w_light, w_view)
+        return light_functions.evaluate_analytic(self, kernel, uv, w_light, w_view, draw=draw)
 
     def luminance_tables(self, texels: np.ndarray, views: np.ndarray) -> np.ndarray:
         """Model of luminance at measured views and all measured lights, shape (n, n_views, n_lights)."""

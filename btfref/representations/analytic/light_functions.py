@@ -24,6 +24,7 @@ from btfref.representations.lookup import (
     base_meta,
     direction_arrays,
     evaluate_points,
+    given,
     refuse_not_finite,
 )
 
@@ -67,6 +68,8 @@ def evaluate_analytic(
     uv: ArrayLike,
     w_light: ArrayLike,
     w_view: ArrayLike,
+    *,
+    draw: ArrayLike | None = None,
 ) -> np.ndarray:
     """Evaluate a method whose maps are functions of the light.
 
@@ -77,6 +80,8 @@ def evaluate_analytic(
     kernel : callable
         ``HeldStencils -> (N, 3)`` float64.
     uv, w_light, w_view : array_like, shape (..., 2), (..., 3), (..., 3)
+    draw : array_like, shape (...), optional
+        See :meth:`btfref.representations.protocol.DrawsViews.evaluate`.
 
     Returns
     -------
@@ -85,14 +90,14 @@ def evaluate_analytic(
     meta = representation.meta
     views = interpolation.from_arrays(representation.arrays(), "view")
 
-    def lookup(uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray) -> np.ndarray:
+    def lookup(uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray, *draws: np.ndarray) -> np.ndarray:
         texel, texel_weight = conventions.texel_stencil(uv, meta["texels"], meta["filter_type"])
-        view, view_weight = views.stencil(w_view)
+        view, view_weight = views.stencil(w_view, draw=draws[0] if draws else None)
         light, fade = held(w_light, meta["constants"]["light_edge"])
         held_view, _ = held(w_view, meta["constants"]["view_edge"])
         return fade[:, None] * kernel(HeldStencils(texel, texel_weight, view, view_weight, light, held_view))
 
-    return evaluate_points(lookup, uv, w_light, w_view)
+    return evaluate_points(lookup, uv, w_light, w_view, *given(draw))
 
 
 def held(w: ArrayLike, edge: float) -> tuple[np.ndarray, np.ndarray]:

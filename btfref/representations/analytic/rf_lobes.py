@@ -83,6 +83,7 @@ class Representation(light_functions.AnalyticMaps):
 
     #: Maps by view; see :mod:`btfref.representations.file.resident`.
     DIRECTION_AXES: ClassVar = {"view": {"lobes": 2}}
+    DRAWS_VIEWS: ClassVar = True
     ROWS_BY: ClassVar = {"lobes": (2,)}
     EXPONENTS: ClassVar = {"lobes": (2, 4)}
 
@@ -98,9 +99,15 @@ class Representation(light_functions.AnalyticMaps):
         return Schema(maps, light_functions.EDGES | {"n_lobes": Number("lobes")})
 
     def evaluate(
-        self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
+        self,
+        uv: ArrayLike,
+        w_light: ArrayLike,
+        w_view: ArrayLike,
+        *,
+        lod: ArrayLike = 0.0,
+        draw: ArrayLike | None = None,
     ) -> np.ndarray:
-        """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored. Never negative."""
+        """See :meth:`btfref.representations.protocol.DrawsViews.evaluate`; ``lod`` is ignored. Never negative."""
         lobes = self._lobes()
         colour = real(self.maps["colour"].reshape(-1, 4))
 
@@ -112,7 +119,7 @@ class Representation(light_functions.AnalyticMaps):
             value += s.texel_weight * at[..., 3] * s.w_light[:, None, 2]
             return np.einsum("nt,ntc->nc", value, at[..., :3])
 
-        return light_functions.evaluate_analytic(self, kernel, uv, w_light, w_view)
+        return light_functions.evaluate_analytic(self, kernel, uv, w_light, w_view, draw=draw)
 
     def _lobes(self) -> np.ndarray:
         """Lobes by flat texel and view, shape (n_texels, n_views, k, 4)."""

@@ -54,6 +54,7 @@ class Representation(light_functions.AnalyticMaps):
 
     #: Maps by view; see :mod:`btfref.representations.file.resident`.
     DIRECTION_AXES: ClassVar = {"view": {"polynomial": 2}}
+    DRAWS_VIEWS: ClassVar = True
     ROWS_BY: ClassVar = {"polynomial": (2,)}
 
     @classmethod
@@ -66,9 +67,15 @@ class Representation(light_functions.AnalyticMaps):
         return Schema(maps, light_functions.EDGES)
 
     def evaluate(
-        self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
+        self,
+        uv: ArrayLike,
+        w_light: ArrayLike,
+        w_view: ArrayLike,
+        *,
+        lod: ArrayLike = 0.0,
+        draw: ArrayLike | None = None,
     ) -> np.ndarray:
-        """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored.
+        """See :meth:`btfref.representations.protocol.DrawsViews.evaluate`; ``lod`` is ignored.
 
         May be negative where a polynomial undershoots.
         """
@@ -82,7 +89,7 @@ class Representation(light_functions.AnalyticMaps):
             value = np.einsum("ntv,nt,nv->nt", value, s.texel_weight, s.view_weight)
             return np.einsum("nt,ntc->nc", value, chroma[s.texel])
 
-        return light_functions.evaluate_analytic(self, kernel, uv, w_light, w_view)
+        return light_functions.evaluate_analytic(self, kernel, uv, w_light, w_view, draw=draw)
 
     def luminance_tables(self, texels: np.ndarray, views: np.ndarray) -> np.ndarray:
         """Model of luminance at measured views and all measured lights, shape (n, n_views, n_lights)."""

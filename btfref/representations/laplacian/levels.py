@@ -17,7 +17,7 @@ from btfref.precision import real
 from btfref.representations.analytic.light_functions import EDGES, held
 from btfref.representations.file.schema import FLOATS, Constant, MapSchema, OneOf, Range, Schema
 from btfref.representations.guide import N_GROUPS, feature_views, group_means, texel_groups
-from btfref.representations.lookup import PAIRS, StoredMaps, evaluate_points, packed_arrays
+from btfref.representations.lookup import PAIRS, StoredMaps, evaluate_points, given, packed_arrays
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -43,6 +43,7 @@ class Representation(StoredMaps):
     """
 
     DIRECTION_AXES: ClassVar = {"view": {"basis_*": 0, "mean": 0}, "light": {"basis_*": 1, "mean": 1}}
+    DRAWS_VIEWS: ClassVar = True
     LEVELS: ClassVar = ("basis_*", "weights_*")
     ROWS_BY: ClassVar = {"basis_*": (0,), "mean": (0,)}
 
@@ -82,9 +83,15 @@ class Representation(StoredMaps):
         return len(self.meta["levels"]) - 1.0
 
     def evaluate(
-        self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
+        self,
+        uv: ArrayLike,
+        w_light: ArrayLike,
+        w_view: ArrayLike,
+        *,
+        lod: ArrayLike = 0.0,
+        draw: ArrayLike | None = None,
     ) -> np.ndarray:
-        """See :meth:`btfref.representations.protocol.Representation.evaluate`.
+        """See :meth:`btfref.representations.protocol.DrawsViews.evaluate`.
 
         ``lod`` has the shape of one value a lookup or broadcasts to it; it is clamped to [0, λ_max]. Between whole
         numbers the levels' images are blended, so that the value is continuous in λ. May be slightly negative where
@@ -94,8 +101,11 @@ class Representation(StoredMaps):
         nearest = self.meta["constants"]["nearest_directions"]
         levels = self.meta["levels"]
 
-        def lookup(uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray, lod: np.ndarray) -> np.ndarray:
-            view, light = views.stencil(w_view), lights.stencil(w_light, hold=False)
+        def lookup(
+            uv: np.ndarray, w_light: np.ndarray, w_view: np.ndarray, lod: np.ndarray, *draws: np.ndarray
+        ) -> np.ndarray:
+            view = views.stencil(w_view, draw=draws[0] if draws and not nearest else None)
+            light = lights.stencil(w_light, hold=False)
             if nearest:
                 view, light = (_heaviest(*stencil) for stencil in (view, light))
             pairs = view[0][:, :, None], light[0][:, None, :]
@@ -114,7 +124,7 @@ class Representation(StoredMaps):
             return total @ real(TO_RGB.T)
 
         gathered = PAIRS * max([1, *(sum(level["components"]) for level in levels)])
-        return evaluate_points(lookup, uv, w_light, w_view, lod, gathered=gathered)
+        return evaluate_points(lookup, uv, w_light, w_view, lod, *given(draw), gathered=gathered)
 
     def _mean(
         self,

@@ -70,6 +70,7 @@ class Representation(StoredMaps):
     """
 
     DIRECTION_AXES: ClassVar = {"view": {"basis": 2}, "light": {"basis": 3}}
+    DRAWS_VIEWS: ClassVar = True
     ENTRIES: ClassVar = Entries("cluster", {"basis": 0}, "weights")
     ROWS_BY: ClassVar = {"basis": (0, 2)}
 
@@ -84,9 +85,15 @@ class Representation(StoredMaps):
         return Schema(maps, {"n_components": Number("components")})
 
     def evaluate(
-        self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
+        self,
+        uv: ArrayLike,
+        w_light: ArrayLike,
+        w_view: ArrayLike,
+        *,
+        lod: ArrayLike = 0.0,
+        draw: ArrayLike | None = None,
     ) -> np.ndarray:
-        """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored.
+        """See :meth:`btfref.representations.protocol.DrawsViews.evaluate`; ``lod`` is ignored.
 
         May be slightly negative where the truncated expansion undershoots.
         """
@@ -111,7 +118,9 @@ class Representation(StoredMaps):
             table = real(basis[index])  # n, t, v, l, component, channel: advanced axes come first
             return np.einsum("ntk,nvl,ntvlkc->nc", texel_coefficient, s.pair_weight, table, optimize=True)
 
-        return evaluate_tabulated(self, kernel, uv, w_light, w_view, gathered=4 * PAIRS * 3 * basis.shape[1])
+        return evaluate_tabulated(
+            self, kernel, uv, w_light, w_view, draw=draw, gathered=4 * PAIRS * 3 * basis.shape[1]
+        )
 
     def port_arrays(self) -> dict[str, np.ndarray]:
         """``basis`` [cluster, view, light, (1 + component) · 3]: one direction pair of one cluster is contiguous."""

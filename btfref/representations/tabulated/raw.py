@@ -43,6 +43,7 @@ class Representation(StoredMaps):
     """Table ``values`` [row, column, view, light, 3] and the directions it is sampled at."""
 
     DIRECTION_AXES: ClassVar = {"view": {"values": 2}, "light": {"values": 3}}
+    DRAWS_VIEWS: ClassVar = True
 
     @classmethod
     def schema(cls, meta: Facts, names: Collection[str]) -> Schema:
@@ -50,9 +51,15 @@ class Representation(StoredMaps):
         return Schema({"values": MapSchema("rows columns views lights 3", absent=True)})
 
     def evaluate(
-        self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
+        self,
+        uv: ArrayLike,
+        w_light: ArrayLike,
+        w_view: ArrayLike,
+        *,
+        lod: ArrayLike = 0.0,
+        draw: ArrayLike | None = None,
     ) -> np.ndarray:
-        """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored."""
+        """See :meth:`btfref.representations.protocol.DrawsViews.evaluate`; ``lod`` is ignored."""
         values = self.maps["values"]
         table = values.reshape(-1, *values.shape[2:])
         partial = self.meta.get("partial", False)
@@ -69,7 +76,7 @@ class Representation(StoredMaps):
                 raise InputError("a lookup needs texels or pairs that are not resident", field="texels")
             return result
 
-        return evaluate_tabulated(self, kernel, uv, w_light, w_view)
+        return evaluate_tabulated(self, kernel, uv, w_light, w_view, draw=draw)
 
     def sampling_tables(self) -> tuple[np.ndarray, np.ndarray]:
         """Groups of texels alike, and their means."""

@@ -54,6 +54,7 @@ class Representation(StoredMaps):
     """Maps: ``basis`` [component, view, light, 3], ``weights`` [row, column, component], direction tables."""
 
     DIRECTION_AXES: ClassVar = {"view": {"basis": 1}, "light": {"basis": 2}}
+    DRAWS_VIEWS: ClassVar = True
     ROWS_BY: ClassVar = {"basis": (1,)}
 
     @classmethod
@@ -66,9 +67,15 @@ class Representation(StoredMaps):
         return Schema(maps, {"n_components": Number("components")})
 
     def evaluate(
-        self, uv: ArrayLike, w_light: ArrayLike, w_view: ArrayLike, *, lod: ArrayLike = 0.0
+        self,
+        uv: ArrayLike,
+        w_light: ArrayLike,
+        w_view: ArrayLike,
+        *,
+        lod: ArrayLike = 0.0,
+        draw: ArrayLike | None = None,
     ) -> np.ndarray:
-        """See :meth:`btfref.representations.protocol.Representation.evaluate`; ``lod`` is ignored.
+        """See :meth:`btfref.representations.protocol.DrawsViews.evaluate`; ``lod`` is ignored.
 
         May be slightly negative where the truncated expansion undershoots.
         """
@@ -81,7 +88,9 @@ class Representation(StoredMaps):
             table = real(basis[:, s.view[:, :, None], s.light[:, None, :]])
             return np.einsum("nk,nvl,knvlc->nc", coefficient, s.pair_weight, table, optimize=True)
 
-        return evaluate_tabulated(self, kernel, uv, w_light, w_view, gathered=PAIRS * 3 * len(basis))
+        return evaluate_tabulated(
+            self, kernel, uv, w_light, w_view, draw=draw, gathered=PAIRS * 3 * len(basis)
+        )
 
     def port_arrays(self) -> dict[str, np.ndarray]:
         """``basis`` [view, light, component · 3]: one direction pair is contiguous."""

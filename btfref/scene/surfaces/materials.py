@@ -70,6 +70,7 @@ class PlainMaterial:
     lod: ClassVar[str] = "none"
     lod_bias: ClassVar[float] = 0.0
     lod_unit: ClassVar[float] = 1.0
+    interpolation: ClassVar[str] = "blended"
     turn: ClassVar[Turn] = Turn()
 
     @property

@@ -45,6 +45,9 @@ SETTINGS: Facts = {"grid": 4, "size": (48, 48)}
 #: Method → environment: few lights for the one, the maps alone for the other.
 ENVIRONMENTS = {"lpca": "bright-texel", "rf_lobes": "constant"}
 
+#: Of real time that draws views.
+FRAMES = 64
+
 #: Samples of each of the six tests.
 CHI2_SAMPLES = 200_000
 
@@ -251,6 +254,19 @@ class Bench:
         image = 1.05 * expected if change == "bright" else expected
         variance = np.full(expected.shape, sigma**2)
         return compare(image, reference, classes=classes, gate=NOISY, variance=variance, flip=False).gates
+
+    def drawn(self, subject: Subject) -> Gates:
+        """Real time that draws views, many frames of it, against real time that blends them."""
+        from btfref.rendering.gl.realtime import realtime
+
+        scene, parameters, _, classes = self.reference(subject)
+        shared: Facts = {"parameters": parameters, "shadows": False, "size": SETTINGS["size"], "grid": 2}
+        blended = realtime(scene, **shared).image
+        noisy = realtime(scene, interpolation="drawn", frames=FRAMES, **shared)
+        found = compare(
+            blended, noisy.image, classes=classes, gate=NOISY, variance=noisy.variance, flip=False
+        )
+        return found.gates
 
     def witness(self, subject: Subject, change: str = "") -> Gates:
         """Both renderers against the witness, and against each other; the fault is the same in both."""

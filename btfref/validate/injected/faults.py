@@ -178,6 +178,12 @@ FAULTS = (
         change="bright",
     ),
     Fault(
+        "views drawn with wrong weights",
+        "image.equivalence.relative_rmse",
+        "drawn",
+        edit=("lib/lookup/draws.glsl", "number >= before &&", "number >= 0.25 * float(i) &&"),
+    ),
+    Fault(
         "environment mirrored",
         "image.environment_lights.relative_rmse",
         "environment",

@@ -1,8 +1,14 @@
 // Provides view_stencil and light_stencil: neighbours of a direction among the measured ones; directions_valid.
 // Expects the samplers view_rings or view_triangles and view_cells, the same for light_, and light_directions; view_slots, light_slots.
+// With DRAWN_VIEWS the view's is one neighbour, drawn by view_draw, a number in [0, 1) that the host sets before it asks.
 
+#include "lib/lookup/draws.glsl"
 #include "lib/lookup/rings.glsl"
 #include "lib/lookup/triangles.glsl"
+
+#ifdef DRAWN_VIEWS
+float view_draw = 0.0;
+#endif
 
 #ifdef VIEW_RINGS_DIM0
 uniform sampler2DArray view_rings;
@@ -51,11 +57,18 @@ Stencil kept_samples(usampler2DArray slots, Stencil s) {
 }
 #endif
 
-Stencil view_stencil(vec3 w) {
+Stencil view_neighbours(vec3 w) {
 #ifdef VIEW_RINGS_DIM0
-    Stencil s = ring_stencil(view_rings, VIEW_RINGS_DIM0, w);
+    return ring_stencil(view_rings, VIEW_RINGS_DIM0, w);
 #else
-    Stencil s = triangle_stencil(view_triangles, VIEW_TRIANGLES_DIM0, view_cells, VIEW_CELLS_DIM0, w, false);
+    return triangle_stencil(view_triangles, VIEW_TRIANGLES_DIM0, view_cells, VIEW_CELLS_DIM0, w, false);
+#endif
+}
+
+Stencil view_stencil(vec3 w) {
+    Stencil s = view_neighbours(w);
+#if defined(DRAWN_VIEWS) && !defined(NEAREST_VIEW)
+    s = drawn(s, view_draw);
 #endif
 #ifdef VIEW_SLOTS_DIM0
     s = kept_samples(view_slots, s);

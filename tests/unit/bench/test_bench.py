@@ -97,7 +97,7 @@ def test_every_shipped_plan_can_be_read():
             assert plan.entries
     everything = read_plan(shipped()["realtime"])
     assert {e.method for e in everything.entries} == set(methods())
-    assert all(len(e.query) == 2 for e in everything.entries)
+    assert all(len(e.query) == 4 for e in everything.entries)
 
 
 @pytest.mark.parametrize(
@@ -109,6 +109,7 @@ def test_every_shipped_plan_can_be_read():
         (('key = "raw"', 'key = "rau"'), "method.key"),
         (('key = "sklearn"', 'key = "sklern"'), "peer.key"),
         (("filter_type", "filtr"), "query"),
+        (("[query]", "[query]\ninterpolation = 'drawn'"), "measures with query.interpolation"),
         (('bytes_of = "lpca', 'bytes_of = "lpka'), "method.bytes_of"),
         (('baseline = "raw"', 'baseline = "row"'), "baseline"),
     ],
@@ -120,6 +121,28 @@ def test_plans_with_mistakes_are_refused(tmp_path, change, field):
     with pytest.raises(InputError) as caught:
         read_plan(path)
     assert caught.value.field == field
+
+
+def test_drawn_pictures_stand_beside_blended_ones():
+    """Half the time and three times the variance: two thirds of the efficiency, error √1.5 after equal time."""
+    shared = {"record": "render", "run": 0, "material": "m", "entry": "raw", "scene": "s", "kernels": None}
+    shared |= {"cold_s": 1.0, "mean": 1.0, "spp": 1}
+    ways = {"blended": ([4.0, 8.0], 1.0), "drawn": ([2.0, 4.0], 3.0)}
+    records = [
+        {**shared, "query": {"interpolation": way}, "warm_s": times, "variance": v, "baseline_s": [1.0, 2.0]}
+        for way, (times, v) in ways.items()
+    ]
+    base = {**shared, "entry": None, "name": "principled + bitmap", "query": {}, "warm_s": [1.0, 2.0]}
+    run_of = {"record": "run", "id": 0, "plan": {"name": "render", "baseline": ""}}
+    rows = metrics.rows("", [run_of, {**base, "variance": 1.0}, *records])
+    drawn = next(r for r in rows if r["query"] == "drawn")
+    assert drawn["time_ratio"]["median"] == 0.5
+    assert drawn["variance_ratio"] == 3.0
+    assert drawn["efficiency"] == 1 / 1.5
+    assert drawn["equal_time_error"] == pytest.approx(1.5**0.5)
+    assert all("efficiency" not in r for r in rows if r is not drawn)
+    (_, header, lines), *_ = tables.tables(rows)
+    assert "0.67" in lines[-1][header.index("efficiency")]
 
 
 def test_only_and_quick(plan_file, tmp_path):

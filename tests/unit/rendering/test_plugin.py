@@ -50,6 +50,7 @@ def test_other_variants_are_refused(variant, need):
         ({"scale": -1.0}, "scale"),
         ({"scale": float("nan")}, "scale"),
         ({"sampling": "none"}, "sampling"),
+        ({"interpolation": "linear"}, "interpolation"),
     ],
 )
 def test_bad_parameters_name_the_field(fits, llvm, load_plugin, parameters, field):
