@@ -97,6 +97,39 @@ class TiledScene:
 
     def locate(self, origin: JitArray, direction: JitArray) -> tuple[JitArray, JitArray]:
         """As `intersect`, and the preliminary intersection, which knows the triangle."""
+        origin, hit = self._search(origin, direction, True)
+        return self._interaction(origin, direction, hit), hit
+
+    def reached(
+        self, origin: JitArray, direction: JitArray, active: JitArray = True
+    ) -> tuple[JitArray, JitArray, JitArray]:
+        """As `locate`, of the rays that hit something alone: most of those that leave a surface do not.
+
+        Parameters
+        ----------
+        origin : mitsuba.Point3f
+        direction : mitsuba.Vector3f
+        active : mitsuba.Bool
+            Rays to be traced.
+
+        Returns
+        -------
+        index : mitsuba.UInt32
+            Which rays hit.
+        interaction, preliminary : mitsuba.SurfaceInteraction3f, mitsuba.PreliminaryIntersection3f
+            Of these.
+        """
+        import drjit as dr
+
+        origin, hit = self._search(origin, direction, active)
+        valid = hit.is_valid()
+        dr.eval(origin, hit, valid)
+        index = dr.compress(valid)
+        origin, direction, hit = (dr.gather(type(a), a, index) for a in (origin, direction, hit))
+        return index, self._interaction(origin, direction, hit), hit
+
+    def _search(self, origin: JitArray, direction: JitArray, active: JitArray) -> tuple[JitArray, JitArray]:
+        """Start of the part of each ray that hits something, and the preliminary intersection."""
         import drjit as dr
         import mitsuba as mi
 
@@ -114,18 +147,24 @@ class TiledScene:
             origin = dr.select(searching, end, origin)
             return origin, hit, searching, rounds + 1
 
-        hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(origin))
-        hit.t = dr.full(mi.Float, math.inf, dr.width(origin))
-        searching = dr.full(mi.Bool, True, dr.width(origin))
-        rounds = dr.zeros(mi.UInt32, dr.width(origin))
-        state = (origin, hit, searching, rounds)
+        width = dr.width(origin)
+        hit = dr.zeros(mi.PreliminaryIntersection3f, width)
+        hit.t = dr.full(mi.Float, math.inf, width)
+        state = (origin, hit, dr.full(mi.Bool, True, width) & active, dr.zeros(mi.UInt32, width))
         origin, hit, _, _ = dr.while_loop(state, lambda origin, hit, searching, rounds: searching, search)
+        return origin, hit
+
+    def _interaction(self, origin: JitArray, direction: JitArray, hit: JitArray) -> JitArray:
+        """What is known of a hit, moved to the central tile."""
+        import drjit as dr
+        import mitsuba as mi
+
         interaction = hit.compute_surface_interaction(
             mi.Ray3f(origin, direction), mi.RayFlags.All, hit.is_valid()
         )
         p = interaction.p
         interaction.p = mi.Point3f(p.x - dr.floor(p.x), p.y - dr.floor(p.y), p.z)
-        return interaction, hit
+        return interaction
 
     def occluded(self, ray: JitArray, active: JitArray, *, coherent: bool = True) -> JitArray:
         """Whether the infinitely tiled surface blocks rays that start in the central tile.

@@ -210,7 +210,14 @@ class PathEstimator:
 
         lane, origin, direction, throughput = state
         depth = dr.opaque(mi.UInt32, number)
-        interaction = self.tiles.intersect(origin, direction)
+        if number == 1:
+            interaction = self.tiles.intersect(origin, direction)
+        else:
+            # Most rays that leave the surface hit nothing: SIMD lanes would idle in what follows.
+            index, interaction, _ = self.tiles.reached(origin, direction)
+            if dr.width(index) == 0:
+                return state, dr.full(mi.Bool, False, dr.width(lane))
+            lane, throughput = dr.gather(type(lane), lane, index), dr.gather(mi.Color3f, throughput, index)
         active = interaction.is_valid()
         bsdf = interaction.bsdf()
         context = mi.BSDFContext()

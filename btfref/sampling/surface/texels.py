@@ -180,51 +180,40 @@ class TexelWalks:
         drawn, weight = lobes.sample_rest(bsdf, number, albedo, si, lobe, mi.Point2f(u, v), valid)
         active = valid & (dr.max(dr.abs(weight)) > 0)
         ray = si.spawn_ray(si.to_world(drawn.wo))
-        # What light from this direction sends the other way: BSDF with both directions exchanged, and the
-        # geometry that shading normals leave unbalanced (Veach 1997, sec. 5.3).
-        back = type(si)(si)
-        back.wi = drawn.wo
-        facing = dr.abs(dr.dot(si.n, ray.d))
-        density = dr.abs(dr.dot(si.n, w)) / w.z * drawn.pdf
-        power = lobes.eval_rest(bsdf, number, albedo, back, si.to_local(w), active)
-        power *= facing / (dr.abs(dr.dot(si.n, w)) * drawn.pdf)
-        power = dr.select(active & (drawn.pdf > 0), power * dr.gather(mi.Float, flux, entry, valid), 0)
-        state = [mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Color3f(power), mi.Color3f(weight), stream, choice]
-        state += [facing, density]
-        dr.eval(state, active)
-        alive = dr.compress(active)
-        if dr.width(alive) == 0:
-            return None
-        origin, towards, power, weight, stream, choice, facing, density = (
-            dr.gather(type(a), a, alive) for a in state
-        )
-        hit, found = scene.tiles.locate(origin, towards)
-        surface = Surface.of_interaction(hit, lobes)
-        row = scene.cache.row(found, surface.number)
-        reached = hit.is_valid()
-        dr.eval(row, reached, towards, power, weight, stream, choice, facing, density)
-        there = dr.compress(reached)
+        state = [mi.Vector3f(ray.d), mi.Color3f(weight), drawn.pdf, entry, stream, choice]
+        origin = mi.Point3f(ray.o)
+        dr.eval(origin, state, active)
+        there, hit, found = scene.tiles.reached(origin, state[0], active)
         if dr.width(there) == 0:
             return None
+        towards, weight, pdf, entry, stream, choice = (dr.gather(type(a), a, there) for a in state)
+        place = there // (n_texels * 2 * per_half)
+        w = dr.gather(mi.Vector3f, scene.cache.vectors, place + dr.opaque(mi.UInt32, first))
+        si, bsdf, number, albedo = surface.interaction(dr.gather(mi.UInt32, record, entry))
+        # What light from this direction sends the other way: BSDF with both directions exchanged, and the
+        # geometry that shading normals leave unbalanced (Veach 1997, sec. 5.3).
+        si.wi = si.to_local(towards)
+        facing = dr.abs(dr.dot(si.n, towards))
+        density = dr.abs(dr.dot(si.n, w)) / w.z * pdf
+        power = lobes.eval_rest(bsdf, number, albedo, si, si.to_local(w), True)
+        power *= facing / (dr.abs(dr.dot(si.n, w)) * pdf)
+        power = dr.select(pdf > 0, power * dr.gather(mi.Float, flux, entry), 0)
+        surface = Surface.of_interaction(hit, lobes)
         gathered = {
-            name: dr.gather(type(a), a, there)
-            for name, a in (
-                ("row", row),
-                ("weight", weight),
-                ("power", power),
-                ("lane", stream),
-                ("choice", choice),
-                ("facing", facing),
-                ("density", density),
-            )
+            "row": scene.cache.row(found, surface.number),
+            "weight": weight,
+            "power": power,
+            "lane": stream,
+            "choice": choice,
+            "facing": facing,
+            "density": density,
+            "wi": -towards,
         }
-        gathered["wi"] = -dr.gather(mi.Vector3f, towards, there)
         dr.eval(gathered)
-        which = dr.gather(mi.UInt32, alive, there).numpy()
-        which, texel = np.divmod(which.astype(np.int64), self.n_texels)
+        which, texel = np.divmod(there.numpy().astype(np.int64), self.n_texels)
         which, sample = np.divmod(which, self.per_half)
         numbers = {"direction": first + which // 2, "half": which % 2, "sample": sample, "texel": texel}
-        return gathered | numbers | {"surface": surface.taken(there)}
+        return gathered | numbers | {"surface": surface}
 
     def _look(self) -> None:
         """Visibility of the hits, and what does not depend on where they send light."""

@@ -346,17 +346,15 @@ def continue_walks(
         if dr.width(index) == 0:
             return
         lane, offset, origin, direction, weight = (dr.gather(type(a), a, index) for a in values)
-        hit, place = tiles.locate(origin, direction)
-        surface, reached = Surface.of_interaction(hit, lobes), hit.is_valid()
-        row = cache.row(place, surface.number)
-        dr.eval(row, reached, lane, offset, direction, weight)
-        index = dr.compress(reached)
+        index, hit, place = tiles.reached(origin, direction)
         if dr.width(index) == 0:
             return
-        surface = surface.taken(index)
-        lane, offset, weight, row, direction = (
-            dr.gather(type(a), a, index) for a in (lane, offset, weight, row, direction)
+        surface = Surface.of_interaction(hit, lobes)
+        row = cache.row(place, surface.number)
+        lane, offset, weight, direction = (
+            dr.gather(type(a), a, index) for a in (lane, offset, weight, direction)
         )
+        dr.eval(row, lane, offset, weight, direction)
         si, bsdf, _, _ = surface.interaction(None)
         si.wi = si.to_local(-direction)
         depth = dr.opaque(mi.UInt32, 2 * vertex)
