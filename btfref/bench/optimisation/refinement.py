@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from btfref.bench.data import MESOSTRUCTURES
-from btfref.bench.experiments import offgrid
 from btfref.bench.experiments.between import chosen_of
 from btfref.bench.options import Options
 from btfref.bench.timing import machine
+from btfref.querying import off_grid
 
 if TYPE_CHECKING:
     import numpy as np
@@ -66,12 +66,12 @@ def run(options: Options) -> Facts:
         axes[0] = MESOSTRUCTURES[:1]
     names, keys = chosen_of(axes, options)
     steps, n_rows = (QUICK_STEPS, QUICK_ROWS) if options.quick else (STEPS, ROWS)
-    judged, spp = (offgrid.QUICK_ROWS, offgrid.QUICK_SPP) if options.quick else (JUDGED, JUDGED_SPP)
+    judged, spp = (off_grid.QUICK_ROWS, off_grid.QUICK_SPP) if options.quick else (JUDGED, JUDGED_SPP)
     summary: Facts = {}
     raw: Facts = {}
     for name in names:
         btf = synthesize(name, texels=TEXELS, views="ubo81", lights="ubo81", spp=SPP, estimator="surface")
-        truth, rows = offgrid.true_rows(name, judged, spp, texels=TEXELS), texel_rows(name, n_rows)
+        truth, rows = off_grid.true_rows(name, judged, spp, texels=TEXELS), texel_rows(name, n_rows)
         summary[name], raw[name] = {}, {}
         for i, key in enumerate(keys):
             options.tell(i, len(keys), f"{name}: {key}")
@@ -80,8 +80,8 @@ def run(options: Options) -> Facts:
             made = refine(fitted, rows, steps=steps, footprint="square")
             raw[name][key] = time.process_time() - start
             summary[name][key] = {
-                "before": offgrid.errors(fitted, truth),
-                "after": offgrid.errors(made, truth),
+                "before": off_grid.errors(fitted, truth),
+                "after": off_grid.errors(made, truth),
                 "history": made.meta["refined"][-1],
             }
     parameters = {"texels": TEXELS, "rows": n_rows, "samples": ROW_SPP, "steps": steps, "judged": judged}
@@ -102,7 +102,7 @@ def texel_rows(name: str, n: int) -> dict[str, np.ndarray]:
         "n": n,
         "spp": ROW_SPP,
         "seed": ROW_SEED,
-        "max_theta": offgrid.MAX_THETA,
+        "max_theta": off_grid.MAX_THETA,
         "radius": 0.5 / TEXELS,
         "footprint": "square",
     }
@@ -116,13 +116,13 @@ def table(result: Facts) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     rows = []
     for name, made in result["summary"].items():
         for key, found in made.items():
-            for footprint in offgrid.FOOTPRINTS:
+            for footprint in off_grid.FOOTPRINTS:
                 cells = []
-                for what, (_, form) in offgrid.COLUMNS.items():
+                for what, (_, form) in off_grid.COLUMNS.items():
                     before, after = (found[when][footprint][what][0] for when in ("before", "after"))
                     change = (
                         f"{after - before:+.1f} dB" if what == "psnr_log" else f"{after / before - 1:+.0%}"
                     )
                     cells.append(f"{form.format(before)} → {form.format(after)} ({change})")
                 rows.append((name, key, footprint, *cells, f"{result['raw'][name][key]:.0f}"))
-    return ("material", "method", "footprint", *offgrid.HEADS, "seconds"), rows
+    return ("material", "method", "footprint", *off_grid.HEADS, "seconds"), rows
