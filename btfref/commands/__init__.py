@@ -33,8 +33,10 @@ ELSEWHERE = {
     "board": "datasets.board",
     "dataset": "datasets.dataset",
     "evaluate": "queries.evaluate",
+    "fit": "fitting.fit",
     "import": "import_",  # a module cannot carry the name of a keyword
     "query": "queries.query",
+    "refine": "fitting.refine",
 }
 
 

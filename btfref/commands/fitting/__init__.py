@@ -1,0 +1,1 @@
+"""Commands that make representations, and make them better."""
