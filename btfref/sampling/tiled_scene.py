@@ -117,14 +117,17 @@ class TiledScene:
         index : mitsuba.UInt32
             Which rays hit.
         interaction, preliminary : mitsuba.SurfaceInteraction3f, mitsuba.PreliminaryIntersection3f
-            Of these.
+            Of these; of any width where there are none.
         """
         import drjit as dr
+        import mitsuba as mi
 
         origin, hit = self._search(origin, direction, active)
         valid = hit.is_valid()
         dr.eval(origin, hit, valid)
         index = dr.compress(valid)
+        if dr.width(index) == 0:
+            return index, dr.zeros(mi.SurfaceInteraction3f), dr.zeros(mi.PreliminaryIntersection3f)
         origin, direction, hit = (dr.gather(type(a), a, index) for a in (origin, direction, hit))
         return index, self._interaction(origin, direction, hit), hit
 
