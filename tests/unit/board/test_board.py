@@ -91,15 +91,16 @@ def hand_in(folder, name, spread, **changes):
     return path
 
 
-def test_answers_are_judged_without_the_noise_of_the_truth(tmp_path):
-    path = hand_in(tmp_path / "in", "good", 0.05)
+@pytest.mark.parametrize("spread", [0.02, 0.05])
+def test_answers_are_judged_without_the_noise_of_the_truth(tmp_path, spread):
+    path = hand_in(tmp_path / "in", "good", spread)
     (found,) = scored(rows.read_rows([path]), Truth(tmp_path))
     assert set(found) == set(MATERIALS)
     for footprints in found.values():
         assert set(footprints) == set(sets.FOOTPRINTS)
         for errors in footprints.values():
             _, low, high = errors["rmse"]
-            assert low <= 0.05 <= high
+            assert low <= spread <= high
     path = hand_in(tmp_path / "in", "exact", 0.0)
     (found,) = scored(rows.read_rows([path]), Truth(tmp_path))
     assert found["flat"]["point"]["rmse"][1] == 0
