@@ -141,6 +141,8 @@ def refine(
     start = representation if isinstance(representation, Protocol) else load(representation)
     chosen = None if maps is None else list(maps)
     rng = np.random.default_rng(seed)
+    used: Objective
+    held: Objective
     if scene is None:
         used, held, facts = at_rows(rows_of(data, rng, footprint=footprint), loss, batch, seed, rng)
         return _refined(Variables(start, chosen), used, held, settings, facts, rng, progress)

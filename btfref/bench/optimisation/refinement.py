@@ -33,8 +33,9 @@ JUDGED, JUDGED_SPP = 2500, 64
 #: Methods that are refined by default.
 METHODS = ("lpca", "rf_lobes", "lafortune", "cmf")
 
-#: Steps, and where less is asked for.
-STEPS, QUICK_STEPS, QUICK_ROWS = 200, 20, 5000
+#: Steps, and what is taken where less is asked for.
+STEPS = 200
+QUICK_TEXELS, QUICK_STEPS, QUICK_ROWS = 8, 20, 5000
 
 
 def run(options: Options) -> Facts:
@@ -43,7 +44,7 @@ def run(options: Options) -> Facts:
     Parameters
     ----------
     options : Options
-        ``quick``: the checker, fewer rows and steps. ``only``: some of the mesostructures and of the methods.
+        ``quick``: the checker, fewer texels, rows and steps. ``only``: some of the mesostructures and of the methods.
 
     Returns
     -------
@@ -66,12 +67,13 @@ def run(options: Options) -> Facts:
         axes[0] = MESOSTRUCTURES[:1]
     names, keys = chosen_of(axes, options)
     steps, n_rows = (QUICK_STEPS, QUICK_ROWS) if options.quick else (STEPS, ROWS)
+    texels = QUICK_TEXELS if options.quick else TEXELS
     judged, spp = (off_grid.QUICK_ROWS, off_grid.QUICK_SPP) if options.quick else (JUDGED, JUDGED_SPP)
     summary: Facts = {}
     raw: Facts = {}
     for name in names:
-        btf = synthesize(name, texels=TEXELS, views="ubo81", lights="ubo81", spp=SPP, estimator="surface")
-        truth, rows = off_grid.true_rows(name, judged, spp, texels=TEXELS), texel_rows(name, n_rows)
+        btf = synthesize(name, texels=texels, views="ubo81", lights="ubo81", spp=SPP, estimator="surface")
+        truth, rows = off_grid.true_rows(name, judged, spp, texels=texels), texel_rows(name, n_rows, texels)
         summary[name], raw[name] = {}, {}
         for i, key in enumerate(keys):
             options.tell(i, len(keys), f"{name}: {key}")
@@ -84,7 +86,7 @@ def run(options: Options) -> Facts:
                 "after": off_grid.errors(made, truth),
                 "history": made.meta["refined"][-1],
             }
-    parameters = {"texels": TEXELS, "rows": n_rows, "samples": ROW_SPP, "steps": steps, "judged": judged}
+    parameters = {"texels": texels, "rows": n_rows, "samples": ROW_SPP, "steps": steps, "judged": judged}
     return {
         "suite": "refinement",
         "parameters": parameters,
@@ -94,7 +96,7 @@ def run(options: Options) -> Facts:
     }
 
 
-def texel_rows(name: str, n: int) -> dict[str, np.ndarray]:
+def texel_rows(name: str, n: int, texels: int) -> dict[str, np.ndarray]:
     """Queries of texels of a mesostructure."""
     from btfref.querying.job import QueryJob
 
@@ -103,7 +105,7 @@ def texel_rows(name: str, n: int) -> dict[str, np.ndarray]:
         "spp": ROW_SPP,
         "seed": ROW_SEED,
         "max_theta": off_grid.MAX_THETA,
-        "radius": 0.5 / TEXELS,
+        "radius": 0.5 / texels,
         "footprint": "square",
     }
     job = QueryJob.of(name, None, asked)
