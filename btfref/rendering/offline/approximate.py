@@ -72,7 +72,8 @@ def approximate(
     Returns
     -------
     RenderResult
-        Without cast shadows, on black. ``meta`` as of ``realtime``: ``environment_path`` and its facts.
+        Without cast shadows, on black; with the variance of the mean where ``frames`` draw a place more than once.
+        ``meta`` as of ``realtime``: ``environment_path`` and its facts.
 
     Raises
     ------
@@ -90,6 +91,7 @@ def approximate(
     lighting = lighting_of(description, path, **options)
     start, camera = time.perf_counter(), description.camera
     reps, prepared, total = {}, {}, np.zeros((camera.height * camera.width, 3))
+    noise = np.zeros_like(total)
     wanted = np.full(len(total), True) if pixels is None else np.ravel(pixels)
     # A plain material is evaluated as a representation is.
     rep: Any
@@ -123,7 +125,11 @@ def approximate(
                 if mesh.btf.interpolation == "drawn" and isinstance(rep, DrawsViews):
                     numbers = [place + k * grid**2 for k in range(rounds)]
                     draws = [of_pixels(camera.height, camera.width, k, seed).ravel() for k in numbers]
-                    value = sum(_radiance(*settings, draw[hits.at]) for draw in draws) / rounds
+                    values = np.stack([_radiance(*settings, draw[hits.at]) for draw in draws])
+                    value = values.mean(0)
+                    if rounds > 1:
+                        # Places draw apart from each other.
+                        noise[hits.at] += mesh.btf.scale**2 * values.var(0, ddof=1) / rounds
                 else:
                     value = _radiance(*settings)
                 total[hits.at] += mesh.btf.scale * value
@@ -141,7 +147,8 @@ def approximate(
         meta |= facts[0]
     elif facts:
         meta["environment_path"] = dict(zip(map(str, prepared), facts, strict=True))
-    return RenderResult(image.astype(np.float32), None, meta)
+    variance = (noise / grid**4).reshape(image.shape).astype(np.float32) if rounds > 1 else None
+    return RenderResult(image.astype(np.float32), variance, meta)
 
 
 def _filtered(representation: Representation, filter_type: str | None) -> Representation:
