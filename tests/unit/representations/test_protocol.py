@@ -24,6 +24,8 @@ REPRESENTATIONS = {
     "LitByHarmonics": {"lpca"},
     "LitByTransfer": {"lpca"},
     "HasSchema": set(methods()),
+    "DrawsViews": {"raw", "svd", "lpca", "laplacian", "rf_poly", "rf_lobes", "lafortune_lut"},
+    "HasExponents": {"rf_lobes", "lafortune", "lafortune_lut"},
 }
 
 #: Likewise of fit modules.
