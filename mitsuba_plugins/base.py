@@ -14,8 +14,8 @@ import numpy as np
 
 from btfref.conventions import FILTER_TYPES
 from btfref.errors import InputError
-from btfref.numerics.draws import INTERPOLATIONS
 from btfref.numerics.footprint import MODES
+from btfref.numerics.interpolations import INTERPOLATIONS
 from btfref.numerics.sphere.frames import uv_transform
 from btfref.registry import method
 from btfref.representations.protocol import DrawsViews

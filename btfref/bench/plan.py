@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from btfref.errors import InputError
-from btfref.querying import off_grid
+from btfref.querying import split
 
 if TYPE_CHECKING:
     from btfref.types import Facts, PathLike
@@ -39,8 +39,8 @@ DATA = {
 }
 ROUNDS = {"build": 1, "eval": 5, "render": 5, "sampling": 5, "realtime": 5}
 SETTINGS: Facts = {
-    "off_grid_rows": off_grid.ROWS,
-    "off_grid_spp": off_grid.SPP,
+    "off_grid_rows": split.ROWS,
+    "off_grid_spp": split.SPP,
     "error_samples": 50_000,
     "points": {"numpy": 1 << 14, "drjit": 1 << 20, "glsl": 1 << 18},
     "scenes": ["sphere, suns", "cloth, sky"],

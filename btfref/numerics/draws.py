@@ -10,9 +10,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: How lookups between measured views are interpolated.
-INTERPOLATIONS = ("blended", "drawn")
-
 #: The smallest normal float32: some ports flush what is smaller to 0.
 LEAST = float(np.finfo(np.float32).tiny)
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from btfref.querying.accuracy import accuracy
 from btfref.querying.lookups import lookups
+from btfref.querying.split import FOOTPRINTS, LOOKUPS, MAX_THETA, SPLIT
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -24,25 +25,6 @@ if TYPE_CHECKING:
 
     #: Footprint → columns of its rows.
     Truth = Mapping[str, Mapping[str, np.ndarray]]
-
-#: Seed of the rows that no fit sees: the split between what is fitted and what is judged.
-SPLIT = 1_618_033
-
-#: Largest polar angle, degrees.
-MAX_THETA = 85.0
-
-#: Footprints by name: half sides of squares, in texels of the fits.
-FOOTPRINTS = {"point": 0.0, "texel": 0.5, "4 x 4 texels": 2.0}
-
-#: The footprint that short tables show.
-SHOWN = "texel"
-
-#: Rows of each footprint, samples of each half of a row, and lookups that a method averages over a footprint.
-#: Highlights are rare: many rows of few samples say more than few rows of many.
-ROWS, SPP, LOOKUPS = 20_000, 64, 4
-
-#: Rows where less is asked for.
-QUICK_ROWS, QUICK_SPP = 500, 32
 
 #: Errors of the tables, their heads and how they are written.
 COLUMNS = {

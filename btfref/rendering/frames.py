@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from btfref.errors import SAMPLES, InputError, refuse_above
-from btfref.numerics.draws import INTERPOLATIONS
+from btfref.numerics.interpolations import INTERPOLATIONS
 
 if TYPE_CHECKING:
     from btfref.scene.description import SceneDescription

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from btfref.gates.verdicts import GateResult
-from btfref.querying.off_grid import LOOKUPS
+from btfref.querying.split import LOOKUPS
 from btfref.report.cell import Cell, asset, script_json
 from btfref.report.figures import thumbnail
 from btfref.report.pack import pack, pack_text

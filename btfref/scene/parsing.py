@@ -15,8 +15,8 @@ from types import ModuleType
 import numpy as np
 
 from btfref.errors import InputError, refuse_large_picture
-from btfref.numerics.draws import INTERPOLATIONS
 from btfref.numerics.footprint import MODES
+from btfref.numerics.interpolations import INTERPOLATIONS
 from btfref.numerics.sphere.frames import uv_transform
 from btfref.platform import set_variant
 from btfref.representations.file.container import refuse_store

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from btfref.querying import off_grid
+from btfref.querying import off_grid, split
 
 if TYPE_CHECKING:
     from btfref.types import Facts
@@ -39,7 +39,7 @@ def rows(result: Validation) -> list[list[Any]]:
         cells = [c for c in result.cells if (c.facts["mesostructure"], c.facts["method"]) == mine]
         passed = sum(cell.outcome == "pass" for cell in cells)
         falls = [cell.facts["waterfall"] for cell in cells if cell.facts["waterfall"]]
-        between = (facts.get("off_grid") or {}).get(off_grid.SHOWN, {})
+        between = (facts.get("off_grid") or {}).get(split.SHOWN, {})
         whole = [_relative(fall["total"]["estimate"], fall) for fall in falls]
         colour = [fall["stages"][-1]["delta_e00_so_far"]["estimate"] for fall in falls]
         table.append(

@@ -185,7 +185,7 @@ def test_both_renderers_refuse_alike(write, tmp_path):
     directed = '<shape type="rectangle"><emitter type="directionalarea"/></shape>'
     cases = {
         "part": ((uneven, SUN), r"part.obj, line 9.*part"),
-        "slip": ((slip, SUN), r"scall.*filename, filter_type, scale"),
+        "slip": ((slip, SUN), r"scall.*filename, filter_type, interpolation, scale"),
         "dark": ((FLOOR,), r"dark.xml: the scene has no light"),
         "directed": ((FLOOR, directed), "directionalarea.*tracing particles"),
     }

@@ -13,7 +13,7 @@ from btfref.bench.data import MESOSTRUCTURES
 from btfref.bench.experiments.between import TEXELS, chosen_of, fitted_to
 from btfref.bench.options import Options
 from btfref.bench.timing import machine
-from btfref.querying import off_grid
+from btfref.querying import off_grid, split
 
 if TYPE_CHECKING:
     from btfref.numerics.sphere.directions import DirectionSet
@@ -45,7 +45,7 @@ def run(options: Options) -> Facts:
     if options.quick:
         axes = [MESOSTRUCTURES[:1], ("10x5", "adaptive:50")]
     names, sets = chosen_of(axes, options)
-    n, spp = (off_grid.QUICK_ROWS, off_grid.QUICK_SPP) if options.quick else (off_grid.ROWS, off_grid.SPP)
+    n, spp = (split.QUICK_ROWS, split.QUICK_SPP) if options.quick else (split.ROWS, split.SPP)
     summary: Facts = {}
     for k, name in enumerate(names):
         truth = off_grid.true_rows(name, n, spp, TEXELS)
@@ -62,10 +62,10 @@ def run(options: Options) -> Facts:
     return {
         "suite": "directions",
         "parameters": {
-            "split": off_grid.SPLIT,
+            "split": split.SPLIT,
             "rows": n,
             "samples": 2 * spp,
-            "max_theta": off_grid.MAX_THETA,
+            "max_theta": split.MAX_THETA,
         },
         "summary": summary,
         "machine": machine(),
@@ -87,6 +87,6 @@ def table(result: Facts) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     rows = []
     for name, sets in result["summary"].items():
         for label, found in sets.items():
-            cells = off_grid.cells(found["errors"][off_grid.SHOWN])
+            cells = off_grid.cells(found["errors"][split.SHOWN])
             rows.append((name, label, str(found["directions"]), str(found["pictures"]), *cells))
     return ("material", "set", "directions", "pictures", *off_grid.HEADS), rows

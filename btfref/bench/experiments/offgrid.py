@@ -14,19 +14,8 @@ from btfref.bench.data import MESOSTRUCTURES
 from btfref.bench.experiments.between import TEXELS, chosen_of, fitted_to
 from btfref.bench.options import Options
 from btfref.bench.timing import machine
-from btfref.querying.off_grid import (
-    HEADS,
-    LOOKUPS,
-    MAX_THETA,
-    QUICK_ROWS,
-    QUICK_SPP,
-    ROWS,
-    SPLIT,
-    SPP,
-    cells,
-    errors,
-    true_rows,
-)
+from btfref.querying.off_grid import HEADS, cells, errors, true_rows
+from btfref.querying.split import LOOKUPS, MAX_THETA, QUICK_ROWS, QUICK_SPP, ROWS, SPLIT, SPP
 from btfref.registry import methods
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from btfref.bench.data import MESOSTRUCTURES
 from btfref.bench.experiments.between import chosen_of
 from btfref.bench.options import Options
 from btfref.bench.timing import machine
-from btfref.querying import off_grid
+from btfref.querying import off_grid, split
 
 if TYPE_CHECKING:
     import numpy as np
@@ -68,7 +68,7 @@ def run(options: Options) -> Facts:
     names, keys = chosen_of(axes, options)
     steps, n_rows = (QUICK_STEPS, QUICK_ROWS) if options.quick else (STEPS, ROWS)
     texels = QUICK_TEXELS if options.quick else TEXELS
-    judged, spp = (off_grid.QUICK_ROWS, off_grid.QUICK_SPP) if options.quick else (JUDGED, JUDGED_SPP)
+    judged, spp = (split.QUICK_ROWS, split.QUICK_SPP) if options.quick else (JUDGED, JUDGED_SPP)
     summary: Facts = {}
     raw: Facts = {}
     for name in names:
@@ -104,7 +104,7 @@ def texel_rows(name: str, n: int, texels: int) -> dict[str, np.ndarray]:
         "n": n,
         "spp": ROW_SPP,
         "seed": ROW_SEED,
-        "max_theta": off_grid.MAX_THETA,
+        "max_theta": split.MAX_THETA,
         "radius": 0.5 / texels,
         "footprint": "square",
     }
@@ -118,7 +118,7 @@ def table(result: Facts) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     rows = []
     for name, made in result["summary"].items():
         for key, found in made.items():
-            for footprint in off_grid.FOOTPRINTS:
+            for footprint in split.FOOTPRINTS:
                 cells = []
                 for what, (_, form) in off_grid.COLUMNS.items():
                     before, after = (found[when][footprint][what][0] for when in ("before", "after"))

@@ -7,7 +7,7 @@ from argparse import ArgumentParser, BooleanOptionalAction, _ActionsContainer
 
 from btfref.commands.shared.reading import count, memory_size, size
 from btfref.errors import GRID, SEED, WORKERS
-from btfref.numerics.draws import INTERPOLATIONS
+from btfref.numerics.interpolations import INTERPOLATIONS
 from btfref.sampling.settings import DTYPES
 from btfref.scene.shipped import ENVIRONMENTS, described, lights, names
 

@@ -148,10 +148,12 @@ def realtime(
                 total += renderer.read()
                 if count_fetches:
                     fetches.append(renderer.fetches())
-            # Welford: rounds differ by little, sums of squares would lose it.
-            change = total / len(offsets) - mean
-            mean += change / (done + 1)
-            squares += change * (total / len(offsets) - mean)
+            total /= len(offsets)
+            # Welford: rounds differ by little, sums of squares would lose it. Values that are no numbers stay none.
+            with np.errstate(invalid="ignore"):
+                change = total - mean
+                mean += change / (done + 1)
+                squares += change * (total - mean)
         image = mean.astype(np.float32)
         variance = (squares / (rounds - 1) / rounds).astype(np.float32) if rounds > 1 else None
         meta = {

@@ -15,7 +15,7 @@ from btfref.bench.options import Options
 from btfref.bench.plan import read_plan
 from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
-from btfref.querying import off_grid
+from btfref.querying import off_grid, split
 from btfref.representations.tabulated import raw
 from btfref.sampling.synthesis import synthesize
 
@@ -46,10 +46,10 @@ def truth(need):
 
 
 def test_rows_have_three_footprints_and_two_halves(truth):
-    assert list(truth) == list(off_grid.FOOTPRINTS)
+    assert list(truth) == list(split.FOOTPRINTS)
     for footprint, rows in truth.items():
-        assert (rows["radius"] == np.float32(off_grid.FOOTPRINTS[footprint] / TEXELS)).all()
-        assert np.degrees(np.arccos(rows["w_view"][:, 2].min())) <= off_grid.MAX_THETA
+        assert (rows["radius"] == np.float32(split.FOOTPRINTS[footprint] / TEXELS)).all()
+        assert np.degrees(np.arccos(rows["w_view"][:, 2].min())) <= split.MAX_THETA
         assert np.array_equal(rows["B"], np.float32(0.5) * (rows["first"] + rows["second"]))
     points, texels = truth["point"], truth["texel"]
     assert not np.array_equal(points["uv"], texels["uv"])
@@ -57,7 +57,7 @@ def test_rows_have_three_footprints_and_two_halves(truth):
 
 def test_what_is_right_has_no_error_and_what_is_double_has_all(truth):
     right, double = (off_grid.errors(Exact(truth, factor), truth) for factor in (1, 2))
-    for footprint in off_grid.FOOTPRINTS:
+    for footprint in split.FOOTPRINTS:
         assert right[footprint]["nrmse"][2] <= tolerance("queries.rounding.length")
         assert off_grid.cells(right[footprint])[2].startswith("∞")
         _, low, high = double[footprint]["nrmse"]
@@ -111,9 +111,7 @@ def sampled(need):
 def test_plans_ask_the_same_rows(plan, truth, sampled, tmp_path, capsys):
     run(read_plan(plan), tmp_path)
     found = [row for row in metrics.rows(tmp_path) if row["kind"] == "off_grid"]
-    assert [(row["entry"], row["query"]) for row in found[:3]] == [
-        ("raw", name) for name in off_grid.FOOTPRINTS
-    ]
+    assert [(row["entry"], row["query"]) for row in found[:3]] == [("raw", name) for name in split.FOOTPRINTS]
     assert len(found) == 6
     expected = off_grid.errors(raw.fit(sampled), truth)
     for row in found[:3]:

@@ -36,6 +36,7 @@ EVALUATORS = {
     "Evaluator": set(methods()),
     "LevelledEvaluator": {"laplacian"},
     "Displaced": {"gbrdf"},
+    "HoldsFixed": {"gbrdf"},
     "Proposes": {"rf_lobes", "lafortune", "lafortune_lut", "gbrdf"},
 }
 

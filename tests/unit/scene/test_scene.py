@@ -193,7 +193,7 @@ BAD = {
         SENSOR
         + f'<shape type="rectangle">{MATERIAL.format("<float name=%s value=%s/>")}</shape>'
         % ('"scall"', '"2"'),
-        "scall.*filename, filter_type, scale",
+        "scall.*filename, filter_type, interpolation, scale",
     ),
     "object in a material": (
         SENSOR + f'<shape type="rectangle">{MATERIAL.format("<bsdf type=%s/>")}</shape>' % '"diffuse"',

@@ -19,7 +19,7 @@ from btfref.conventions import PixelClass
 from btfref.errors import InputError, MissingDependencyError
 from btfref.gates import tolerance, tolerances
 from btfref.images.display import Display
-from btfref.querying import off_grid
+from btfref.querying import split
 from btfref.registry import methods
 from btfref.report.pack import pack, unpack, unpack_text
 from btfref.report.validation import write_validation
@@ -247,7 +247,7 @@ def result(rng):
             "mesostructure": "checker",
             "method": key,
             "gates": cells[0].facts["gates"][:1],
-            "off_grid": {footprint: errors for footprint in off_grid.FOOTPRINTS},
+            "off_grid": {footprint: errors for footprint in split.FOOTPRINTS},
             "bytes": n,
         }
         for key, n in (("lpca", 3000), ("svd", 1000))
@@ -303,7 +303,7 @@ def test_summary_has_a_row_a_method(result):
     assert table[0]["off grid ΔE00"] == 8.5
     assert table[0]["off grid MAE"] == 0.2
     header, lines = off_grid_rows(result)
-    assert [line[:3] for line in lines[:3]] == [["checker", "lpca", name] for name in off_grid.FOOTPRINTS]
+    assert [line[:3] for line in lines[:3]] == [["checker", "lpca", name] for name in split.FOOTPRINTS]
     assert dict(zip(header, lines[0], strict=True))["ΔE00"] == "8.50 (8.00 to 9.00)"
     # Where the checks failed there is no error to show.
     none = replace(result, methods=[{**facts, "off_grid": None} for facts in result.methods])
@@ -437,5 +437,5 @@ def test_settings_say_how_finely():
     assert FULL.texels > QUICK.texels
     assert FULL.size > QUICK.size
     # The rows of benchmarks.
-    assert (FULL.off_grid_rows, FULL.off_grid_spp) == (off_grid.ROWS, off_grid.SPP)
-    assert (QUICK.off_grid_rows, QUICK.off_grid_spp) == (off_grid.QUICK_ROWS, off_grid.QUICK_SPP)
+    assert (FULL.off_grid_rows, FULL.off_grid_spp) == (split.ROWS, split.SPP)
+    assert (QUICK.off_grid_rows, QUICK.off_grid_spp) == (split.QUICK_ROWS, split.QUICK_SPP)
