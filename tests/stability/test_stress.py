@@ -46,7 +46,7 @@ def test_hard_lookups(key, fits, llvm, need):
     assert_all_pass(runner.stress_lookups(fits(key, "scattered"), "formula, scattered", ("glsl",), n=2048))
 
 
-@pytest.mark.parametrize("key", ["svd", "rf_poly"])
+@pytest.mark.parametrize("key", ["svd", pytest.param("rf_poly", marks=pytest.mark.long)])
 def test_hard_data(key, need):
     need("gl")
     need("llvm")
@@ -57,7 +57,7 @@ def test_hard_data(key, need):
             assert {f.check for f in findings} >= {"port"}, f"{name} was refused"
 
 
-@pytest.mark.parametrize("key", ["raw", "svd", "rf_poly"])
+@pytest.mark.parametrize("key", ["raw", pytest.param("svd", marks=pytest.mark.long), "rf_poly"])
 def test_fits_keep_what_they_must(key, need):
     need("llvm")
     assert_all_pass(runner.stress_fits(key))

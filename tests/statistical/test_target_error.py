@@ -86,7 +86,7 @@ def test_a_limit_per_texel_costs_samples_where_it_is_broken(tmp_path, tile):
     assert above[1] <= tolerance("synthesis.target.texels_above") < above[0]
 
 
-@pytest.mark.parametrize("estimator", ["path", "surface"])
+@pytest.mark.parametrize("estimator", [pytest.param("path", marks=pytest.mark.long), "surface"])
 def test_same_bytes_in_one_go_in_parts_and_in_small_blocks(tmp_path, tile, estimator, monkeypatch):
     settings = SETTINGS | {"target_error": 0.05, "seed": 7, "estimator": estimator}
     whole, parts = tmp_path / "whole.btf.zarr", tmp_path / "parts.btf.zarr"

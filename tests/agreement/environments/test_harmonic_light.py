@@ -38,7 +38,9 @@ def rotated_definition(rep, light, uv, w_view, frame):
     return np.einsum("l,nlc,nlc->nc", weight, value, light(np.einsum("nij,lj->nli", frame, w)))
 
 
-@pytest.mark.parametrize(("kind", "order"), [("ubo81", 5), ("scattered", 2), ("ubo81", 7)])
+@pytest.mark.parametrize(
+    ("kind", "order"), [("ubo81", 5), ("scattered", 2), pytest.param("ubo81", 7, marks=pytest.mark.long)]
+)
 def test_shader_agrees_with_float64(need, fits, rng, kind, order):
     need("gl")
     rep, points = fits("lpca", kind), lookups(rng, 1000)

@@ -148,6 +148,7 @@ def test_files_with_wrong_contents_are_refused(quick, tmp_path, change, field):
         load(tmp_path / "x.exr")
 
 
+@pytest.mark.long  # the largest map alone: test_gradients
 def test_the_port_passes_derivatives_of_every_map(tmp_path, need):
     """Backward derivatives of a mean against differences of the definition's."""
     need("llvm")
