@@ -6,6 +6,7 @@ What is made together, in which order and by which process has no influence on a
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from btfref.sampling.paths.adaptive import Plan
     from btfref.sampling.paths.texels import Request
     from btfref.sampling.store.store import BTFStore
+    from btfref.sampling.surface.budget import Shares
 
 _Indices = TypeVar("_Indices", list[int], np.ndarray)
 
@@ -67,17 +69,20 @@ def fill_views(
     if not views:
         return
     shard = tuple(a * b for a, b in zip(store.shard, store.tile, strict=True))
+    surface = job.settings.estimator == "surface"
     size = blocks(
         memory,
         estimator=job.settings.estimator,
         triangles=sum(len(part.faces) for part in job.mesostructure.parts),
         n_views=len(views),
         n_lights=len(job.lights),
+        n_directions=len(np.unique(np.round([*job.views.vectors[views], *job.lights.vectors], 6), axis=0)),
         texels=job.texels,
         shard=shard,
         spp=job.settings.samples if job.settings.target_error is None else adaptive.SURFACE_POINTS,
         # Means over all lights decide how many passes there are: they are made at once.
         split_lights=job.settings.target_error is None,
+        shares=partial(_shares, job) if surface else None,
     )
     work = {
         ("path", "pilot"): _pilot_by_texels,
@@ -89,6 +94,22 @@ def fill_views(
         for view in work(job, writer, views, only or Selection(), plan, size):
             if done is not None:
                 done(view)
+
+
+def _shares(job: Job) -> Shares:
+    """What a small copy of a synthesis by surface points meets."""
+    from btfref.sampling.surface.budget import shares
+
+    with mitsuba_variant(job.settings.variant):
+        found = shares(
+            job.mesostructure,
+            job.views.vectors,
+            job.lights.vectors,
+            spp=job.settings.samples if job.settings.target_error is None else adaptive.SURFACE_POINTS,
+            max_depth=job.settings.max_depth,
+        )
+        _give_back()
+    return found
 
 
 def _regions(store: BTFStore) -> Iterator[tuple[slice, slice, np.ndarray]]:
@@ -201,7 +222,7 @@ def _fill_by_views(
     for group in _groups(views, size.views):
         lights = np.flatnonzero(pairs[group].any(0))
         for chosen in _groups(lights, size.lights):
-            estimator = job.make_estimator(group, lights=chosen, mask=mask)
+            estimator = job.make_estimator(group, lights=chosen, mask=mask, buffer=size.buffer)
             for view, mean, variance in estimator.all_views(group):
                 mine = pairs[view, chosen]
                 # A slice copies nothing; these arrays are large.
@@ -229,13 +250,15 @@ def _groups(items: _Indices, size: int) -> list[_Indices]:
 
 
 def _passes(
-    job: Job, group: list[int], passes: dict[int, int]
+    job: Job, group: list[int], passes: dict[int, int], buffer: int
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """Sums over passes of independent points: (view, mean, variance of the mean) of each view."""
     sums: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     for number in range(max(passes.values())):
         still = [view for view in group if passes[view] > number]
-        estimator = job.make_estimator(still, spp=adaptive.SURFACE_POINTS, stream=(_ESTIMATE, number))
+        estimator = job.make_estimator(
+            still, spp=adaptive.SURFACE_POINTS, stream=(_ESTIMATE, number), buffer=buffer
+        )
         for view, mean, variance in estimator.all_views(still):
             if view not in sums:
                 sums[view] = mean.copy(), variance.copy()
@@ -263,7 +286,7 @@ def _fill_by_passes(
     for group in _groups(order, size.views):
         for view in group:
             store.write_map("samples", view, counts[view] * adaptive.SURFACE_POINTS)
-        for view, mean, variance in _passes(job, group, passes):
+        for view, mean, variance in _passes(job, group, passes, size.buffer):
             store.write_map("reached", view, adaptive.texel_means(mean, variance))
             writer.write_part(view, lights, tiles, mean, variance)
             yield view
@@ -274,7 +297,9 @@ def _pilot_by_views(
 ) -> Iterator[int]:
     store = writer.store
     for group in _groups(views, size.views):
-        estimator = job.make_estimator(group, spp=adaptive.SURFACE_POINTS, stream=(_PILOT, 0))
+        estimator = job.make_estimator(
+            group, spp=adaptive.SURFACE_POINTS, stream=(_PILOT, 0), buffer=size.buffer
+        )
         for view, mean, variance in estimator.all_views(group):
             # Sums over a view are what matters here: one pilot will do for both.
             store.write_map("pilot", view, adaptive.pilot_map((mean, variance), (mean, variance), 1))

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from btfref.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from btfref.sampling.surface.budget import Shares
 
 #: Bytes of a process that holds nothing of the BTF yet: interpreter, Mitsuba, kernels, scene of a small tile.
 BASE = 350 << 20
@@ -29,17 +35,6 @@ BUFFER_RANGE = (8 << 20, 96 << 20)
 #: Bytes per vertex and face of the geometry: ours, Mitsuba's and the acceleration structure's.
 PER_TRIANGLE = 400
 
-#: Surface points, bytes per point: geometry; per point and light: table of light and visibility; per point and
-#: view: bins and walks from texels. Measured at 64² texels and 81 lights and views, results of 304 MiB included:
-#: checker of 10 points 1919 MiB, tissue of 18 points 2395, rings of 25 points 3158; the sums say 2290, 3430, 4420.
-#: Rings of 40 points, 81 lights and 14 of the views 3080 MiB, 14 lights and all views 4308; the sums say 3309, 4542.
-#: Larger ones (checker of 10 points at 128²: 2860 MiB, 6319; at 256²: 7692, 23 638) follow their walks in batches of
-#: the same size: the sums are then two to three times too large, which is on the safe side.
-PER_POINT, PER_POINT_LIGHT, PER_POINT_VIEW = 600, 160, 280
-
-#: Bytes of the surface estimator's buffers, whatever the size of the BTF.
-SURFACE_BASE = 200 << 20
-
 
 @dataclass(frozen=True)
 class Blocks:
@@ -48,7 +43,7 @@ class Blocks:
     Attributes
     ----------
     buffer : int
-        Bytes of the sample buffer of the path estimator.
+        Bytes of the sample buffer of the path estimator, or of the results that the surface estimator makes together.
     views, lights : int
         Views and lights that the surface estimator makes together.
     queue : int
@@ -138,7 +133,9 @@ def blocks(
     texels: tuple[int, int],
     shard: tuple[int, ...],
     spp: int,
+    n_directions: int | None = None,
     split_lights: bool = True,
+    shares: Callable[[], Shares] | None = None,
 ) -> Blocks:
     """Largest blocks within a budget; they have no influence on any result.
 
@@ -158,8 +155,13 @@ def blocks(
         Rows and columns of texels of one file of the store.
     spp : int
         Samples, or points, per texel.
+    n_directions : int, optional
+        Of views and lights together, each once; the sum of both when not given.
     split_lights : bool
         Whether lights may be made in several goes.
+    shares : callable, optional
+        What the surface estimator would meet, found out at some cost: only asked where the most that any surface may
+        need does not fit in one block.
 
     Returns
     -------
@@ -177,22 +179,26 @@ def blocks(
         if buffer < BUFFER_RANGE[0]:
             refuse(budget, budget - free + values * PER_VALUE + BUFFERS * BUFFER_RANGE[0])
         return Blocks(min(buffer, BUFFER_RANGE[1]), 1, n_lights)
-    free -= SURFACE_BASE
-    points = spp * texels[0] * texels[1]
+    from btfref.sampling.surface import budget as surface
 
-    def need(views: int, lights: int) -> int:
-        values = 3 * lights * texels[0] * texels[1]
-        return values * PER_VALUE + points * (PER_POINT + lights * PER_POINT_LIGHT + views * PER_POINT_VIEW)
-
-    # Views first: walks from the surface serve all views that are made together, and lights part them least.
-    parts = range(1, n_lights + 1) if split_lights else (1,)
-    for lights in sorted({-(-n_lights // k) for k in parts}, reverse=True):
-        for views in sorted({-(-n_views // k) for k in (1, 2, 3, 4, 6, 8)}, reverse=True):
-            if need(views, lights) <= free:
-                return Blocks(BUFFER_RANGE[1], views, lights, QUEUE)
-        if need(1, lights) <= free:
-            return Blocks(BUFFER_RANGE[1], 1, lights, QUEUE)
-    refuse(budget, budget - free + need(1, lights))
+    free -= surface.BASE + QUEUE
+    fitting = partial(
+        surface.largest,
+        free,
+        n_views=n_views,
+        n_lights=n_lights,
+        n_directions=n_directions or n_views + n_lights,
+        texels=texels[0] * texels[1],
+        spp=spp,
+        split_lights=split_lights,
+    )
+    size = fitting(found=surface.Shares())
+    if shares is not None and (isinstance(size, int) or size[:2] != (n_views, n_lights)):
+        size = fitting(found=shares())
+    if isinstance(size, int):
+        refuse(budget, budget - free + size)
+    views, lights, buffer = size
+    return Blocks(buffer, views, lights, QUEUE)
 
 
 def refuse(budget: int, least: int, *, what: str = "memory budget too small for these settings") -> NoReturn:

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from btfref.cli import main
 from btfref.errors import InputError, MissingDependencyError
 from btfref.sampling import memory, open_store
 from btfref.sampling.store.layout import shard_shape
+from btfref.sampling.surface.budget import Shares
 from btfref.sampling.synthesis import synthesize_store
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -191,7 +193,10 @@ def test_a_scheduler_that_dies_is_one_line_and_the_run_goes_on(tmp_path, need):
 
 def test_blocks_shrink_with_the_budget():
     facts = {"triangles": 1000, "n_views": 81, "n_lights": 81, "texels": (256, 256), "shard": (256, 256)}
-    large, small = (memory.blocks(budget << 30, estimator="surface", spp=16, **facts) for budget in (64, 4))
+    surface = {"n_directions": 81, "shares": partial(Shares, 0.3, 0.3)}
+    large, small = (
+        memory.blocks(budget << 30, estimator="surface", spp=16, **facts, **surface) for budget in (64, 4)
+    )
     assert (large.views, large.lights) == (81, 81)
     assert small.views * small.lights < 81 * 81
     assert memory.blocks(2 << 30, estimator="path", spp=16, **facts).buffer <= 96 << 20

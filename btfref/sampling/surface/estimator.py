@@ -57,7 +57,7 @@ PILOT_RAYS = 3_000_000
 #: Directions whose pilot rays also look for visible back sides.
 BACK_DIRECTIONS = 8
 
-#: Memory (bytes) of the results of views that are gathered together.
+#: Memory (bytes) of the means of views that are gathered together, at most.
 GATHER_BUFFER = 64 << 20
 
 # Streams of random numbers.
@@ -125,6 +125,8 @@ class SurfaceEstimator:
         Lights that results are of; None for all.
     variance : bool
         Whether variances are made; they take about a third of the time of `all_views`.
+    buffer : int
+        Bytes of the means of views that are gathered together.
 
     Notes
     -----
@@ -147,12 +149,14 @@ class SurfaceEstimator:
         mask: np.ndarray | None = None,
         chosen: ArrayLike | None = None,
         variance: bool = True,
+        buffer: int = GATHER_BUFFER,
     ) -> None:
+        import drjit as dr
         import mitsuba as mi
 
         rows, columns = texels
         self.texels, self.spp, self.seed = (int(rows), int(columns)), int(spp), int(seed)
-        self.mask, self.variance = mask, variance
+        self.mask, self.variance, self.buffer = mask, variance, buffer
         self.n_texels = rows * columns
         views, every = np.asarray(views, np.float64), np.asarray(lights, np.float64)
         asked = np.arange(len(views)) if wanted is None else np.asarray(wanted)
@@ -185,6 +189,8 @@ class SurfaceEstimator:
                 n_texels=self.n_texels, n_vertices=self.n_vertices, seed=self.seed, stream=_REST,
             )  # fmt: skip
             self._walk_from_points()
+        # What making all this took is of other sizes than what results take.
+        dr.flush_malloc_cache()
 
     # --- points and what they see
 
@@ -213,11 +219,15 @@ class SurfaceEstimator:
 
     def _see(self) -> None:
         """Visibility of all points along all directions, bins of all directions, rays for empty texels."""
+        import drjit as dr
+
         scene, n_texels = self.scene, self.n_texels
         n_points = len(self.points.p)
         self.surface = Surface.of_points(self.points, scene.lobes)
         seen = visibility(scene.tiles, self.surface, scene.directions, front_only=self.closed)
-        entries, rays = [], []
+        rays = []
+        self.bins = []
+        place = n_points
         for k, w in enumerate(scene.directions):
             texel, point, weight = footprints(self.points, seen[k], w, self.texels)
             half = point & 1
@@ -231,29 +241,34 @@ class SurfaceEstimator:
                 # which has none, needs for its slope.
                 weight[aided] /= 2 * flux[aided]
                 flux[aided] = 0
-            entries.append((texel, point, weight, half, flux))
-            rays.append(np.stack([*np.nonzero(empty), (total > 0)[empty]], 1))
+            some = np.stack([*np.nonzero(empty), (total > 0)[empty]], 1).astype(np.uint32)
+            rays.append(some)
+            # Records of rays follow those of points, direction after direction.
+            row, column, shared = (np.repeat(values, RAYS).astype(np.int64) for values in some.T)
+            record = place + np.arange(len(row))
+            place += len(row)
+            share = np.where(shared, 0.5, 1.0)
+            parts = zip(
+                (texel, point, weight, half, flux),
+                (column, record, share / RAYS, row, 1 / share),
+                strict=True,
+            )
+            texel, record, weight, half, flux = (np.concatenate(part) for part in parts)
+            self.bins.append(Bins.sorted(texel, record, weight, half, flux, n_texels))
         sights = None
         self.stream = np.arange(n_points, dtype=np.uint32)
-        place = n_points
-        if any(map(len, rays)):
+        if place > n_points:
             found, lane, sights = self._view_rays(rays)
             self.stream = np.concatenate([self.stream, lane])
             self.surface = self.surface.joined(found)
-        self.bins = []
-        used = np.zeros(len(self.stream), bool)
-        wanted = set(self.row.values())
-        for k, (mine, some) in enumerate(zip(entries, rays, strict=True)):
-            half, texel, shared = (np.repeat(column, RAYS) for column in some.T)
-            record = place + np.arange(len(texel))
-            place += len(texel)
-            share = np.where(shared, 0.5, 1.0)
-            parts = zip(mine, (texel, record, share / RAYS, half, 1 / share), strict=True)
-            texel, record, weight, half, flux = (np.concatenate(part) for part in parts)
-            self.bins.append(Bins.sorted(texel, record, weight, half, flux, n_texels))
-            if k in wanted:
-                used[record if self.mask is None else record[self.mask[texel]]] = True
-        self.used = used
+            del found
+            dr.flush_malloc_cache()
+        self.used = np.zeros(place, bool)
+        for k in set(self.row.values()):
+            some = self.bins[k].record
+            if self.mask is not None:
+                some = some[np.repeat(self.mask, np.diff(self.bins[k].start))]
+            self.used[some] = True
         self._light_table(seen[scene.lights.rows.numpy()], sights)
 
     def _view_rays(self, rays: list[np.ndarray]) -> tuple[Surface, np.ndarray, JitArray]:
@@ -359,6 +374,18 @@ class SurfaceEstimator:
                 vertex=2, last=self.n_vertices, stride=4, broad_first=True, count=count,
             )  # fmt: skip
 
+    def counts(self) -> tuple[float, float]:
+        """View rays per texel and direction, and the share of walks from texels that hit something."""
+        import drjit as dr
+
+        if not len(self.lit):
+            return 0.0, 0.0
+        cells = self.n_texels * len(self.scene.directions)
+        rays = (len(self.stream) - len(self.points.p)) / cells
+        hits = self.walks.hits if self.walks is not None else {}
+        found = dr.width(hits["lane"]) if hits else 0
+        return rays, found / (2 * self.rest_walks * cells)
+
     # --- results
 
     def view(self, index: int, w_view: object = None) -> tuple[np.ndarray, np.ndarray | None]:
@@ -376,7 +403,7 @@ class SurfaceEstimator:
         """
         views = list(views)
         each = self.n_texels * max(len(self.lit), 1) * 12
-        together = max(1, min(GATHER_BUFFER // each, (2**31 - 1) * 2 // each))
+        together = max(1, min(self.buffer // each, (2**31 - 1) * 2 // each))
         live = [view for view in views if view in self.row and len(self.lit)]
         together = -(-len(live) // max(1, -(-len(live) // together)))  # none is left alone at the end
         held: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
@@ -388,6 +415,7 @@ class SurfaceEstimator:
                 continue
             if view not in held:
                 now = live[done : done + together]
+                held = {}
                 mean, variance = self._results(now)
                 held = {
                     one: (mean[k], None if variance is None else variance[k]) for k, one in enumerate(now)

@@ -134,6 +134,9 @@ class TexelWalks:
         seed: int,
         stream: int,
     ) -> None:
+        import drjit as dr
+        import mitsuba as mi
+
         self.scene, self.per_half, self.n_texels = scene, per_half, n_texels
         self.n_vertices = n_vertices
         self.keys = stream_keys(seed, stream)
@@ -148,11 +151,12 @@ class TexelWalks:
         self.hits: dict[str, Any] = {}
         if parts:
             self.hits = _joined(parts)
-            self.range = np.searchsorted(self.hits["direction"], np.arange(len(bins) + 1))
-            self._look()
+            self.range = np.searchsorted(self.hits.pop("direction"), np.arange(len(bins) + 1))
+            self.photons = dr.compress(self.hits.pop("bright"))
+            self.photon_range = to_device(mi.UInt32, np.searchsorted(self.photons.numpy(), self.range))
 
     def _start(self, surface: Surface, bins: list[Bins], first: int) -> dict[str, Any] | None:
-        """Walks from the texels of some directions to their first hits."""
+        """Walks from the texels of some directions to their first hits, and what these see."""
         import drjit as dr
         import mitsuba as mi
 
@@ -199,43 +203,29 @@ class TexelWalks:
         power *= facing / (dr.abs(dr.dot(si.n, w)) * pdf)
         power = dr.select(pdf > 0, power * dr.gather(mi.Float, flux, entry), 0)
         surface = Surface.of_interaction(hit, lobes)
-        gathered = {
-            "row": scene.cache.row(found, surface.number),
-            "weight": weight,
-            "power": power,
-            "lane": stream,
-            "choice": choice,
-            "facing": facing,
-            "density": density,
-            "wi": -towards,
-        }
-        dr.eval(gathered)
-        which, texel = np.divmod(there.numpy().astype(np.int64), self.n_texels)
-        which, sample = np.divmod(which, self.per_half)
-        numbers = {"direction": first + which // 2, "half": which % 2, "sample": sample, "texel": texel}
-        return gathered | numbers | {"surface": surface}
-
-    def _look(self) -> None:
-        """Visibility of the hits, and what does not depend on where they send light."""
-        import drjit as dr
-        import mitsuba as mi
-
-        scene, hits = self.scene, self.hits
-        surface, incoming = hits["surface"], hits["wi"]
+        which, texel = np.divmod(there.numpy(), np.uint32(self.n_texels))
+        which //= np.uint32(self.per_half)
+        number = first + (which >> 1)
+        row = scene.cache.row(found, surface.number)
+        dr.eval(row, weight, power, stream, choice, facing, density)
         si, *_ = surface.interaction(None)
-        hits["coded"] = scene.cache.sights(scene.tiles, si, hits["row"], hits["choice"], towards=incoming)
-        cosine = dr.abs(dr.dot(surface.n, incoming))
-        z = to_device(mi.Float, scene.directions[hits["direction"], 2])
-        hits["power"] *= z / (cosine * 2 * self.per_half)
-        hits["density"] *= cosine
-        #: Power, |n·ω| at the start, direction, density, weight.
-        self.what = packed(
-            [*hits["power"], hits["facing"], *incoming, hits["density"], *hits["weight"], mi.Float(0)]
-        )
-        bright = dr.max(dr.abs(hits["power"])) > 0
-        self.photons = dr.compress(bright)
-        first = np.searchsorted(self.photons.numpy(), self.range)
-        self.photon_range = to_device(mi.UInt32, first)
+        coded = scene.cache.sights(scene.tiles, si, row, choice, towards=-towards)
+        cosine = dr.abs(dr.dot(surface.n, towards))
+        power *= to_device(mi.Float, scene.directions[number, 2]) / (cosine * 2 * self.per_half)
+        # Power, |n·ω| at the start, direction, density, weight.
+        what = packed([*power, facing, *-towards, density * cosine, *weight, mi.Float(0)])
+        bright = dr.max(dr.abs(power)) > 0
+        dr.eval(bright)
+        return {
+            "surface": surface.for_lookups(),
+            "lane": stream,
+            "coded": coded,
+            "what": what,
+            "bright": bright,
+            "direction": number.astype(np.uint32),
+            "half": (which & 1).astype(np.uint8),
+            "texel": texel,
+        }
 
     def radiance(self, rows: Sequence[int]) -> JitArray:
         """Light by way of the rest for some directions: [direction, half, texel, light, 3]."""
@@ -267,7 +257,7 @@ class TexelWalks:
         def bring(i: JitArray) -> Callable[[JitArray, JitArray, JitArray], JitArray]:
             i = dr.gather(mi.UInt32, at, i)
             si, bsdf, number, albedo = hits["surface"].interaction(i)
-            e = unpacked(self.what, i, 12)
+            e = unpacked(hits["what"], i, 12)
             si.wi, gain = si.to_local(mi.Vector3f(e[4:7])), share * mi.Color3f(e[8:11])
             facing, density = e[3], e[7]
 
@@ -290,8 +280,8 @@ class TexelWalks:
         keys = self.keys
         lane = dr.gather(mi.UInt32, hits["lane"], at)
         si, bsdf, _, _ = hits["surface"].interaction(at)
-        si.wi = si.to_local(dr.gather(mi.Vector3f, hits["wi"], at))
-        weight = dr.gather(mi.Color3f, hits["weight"], at)
+        e = unpacked(hits["what"], at, 12)
+        si.wi, weight = si.to_local(mi.Vector3f(e[4:7])), mi.Color3f(e[8:11])
         lobe, u, v, _ = uniforms(lane, keys, mi.UInt32(4))
         drawn, gain = bsdf.sample(lobes.full, si, lobe, mi.Point2f(u, v))
         ray = si.spawn_ray(si.to_world(drawn.wo))
@@ -346,7 +336,7 @@ class TexelWalks:
             i = dr.gather(mi.UInt32, self.photons, entry)
             seen = cache.value(dr.gather(mi.UInt8, hits["coded"], dr.fma(i, n, row)))
             si, bsdf, number, albedo = surface.interaction(i)
-            e = unpacked(self.what, i, 12)
+            e = unpacked(hits["what"], i, 12)
             si.wi, incoming = si.to_local(w), si.to_local(mi.Vector3f(e[4:7]))
             spread = dr.abs(dr.dot(si.n, w)) / w.z
             facing, density = e[3], e[7]
@@ -372,23 +362,23 @@ class TexelWalks:
 
 
 def _joined(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Hits of several groups of directions, one after the other."""
+    """Hits of several groups of directions, one after the other; what they are made of is given back on the way."""
     import drjit as dr
 
-    if len(parts) == 1:
-        return parts[0]
-
-    def both(a: Any, b: Any) -> Any:
-        if isinstance(a, np.ndarray):
-            return np.concatenate([a, b])
-        if isinstance(a, Surface):
-            return a.joined(b)
-        if dr.depth_v(a) == 1:
-            return dr.concat([a, b])
-        return type(a)(*(dr.concat([a[k], b[k]]) for k in range(len(a))))
-
-    result = parts[0]
-    for part in parts[1:]:
-        result = {name: both(result[name], part[name]) for name in result}
-    dr.eval({name: value for name, value in result.items() if not isinstance(value, np.ndarray | Surface)})
+    result: dict[str, Any] = {}
+    for name in list(parts[0]):
+        values = [part.pop(name) for part in parts]
+        if len(values) == 1:
+            result[name] = values[0]
+        elif isinstance(values[0], np.ndarray):
+            result[name] = np.concatenate(values)
+        elif isinstance(values[0], Surface):
+            result[name] = Surface(table=dr.concat([some.table for some in values]))
+            dr.eval(result[name].table)
+        else:
+            result[name] = dr.concat(values)
+            dr.eval(result[name])
+        # Dr.Jit keeps what it is given back, and what follows is of other sizes.
+        del values
+        dr.flush_malloc_cache()
     return result

@@ -44,16 +44,16 @@ class Surface:
     albedo : mitsuba.Color3f
         ρ of the broad lobe.
     table : mitsuba.Float
-        All of these side by side, for lookups.
+        All of these side by side, for lookups; where only these are wanted the others are None.
     """
 
-    p: Any
-    n: Any
-    s: Any
-    shading: Any
-    uv: Any
-    number: Any
-    albedo: Any
+    p: Any = None
+    n: Any = None
+    s: Any = None
+    shading: Any = None
+    uv: Any = None
+    number: Any = None
+    albedo: Any = None
     table: Any = None
 
     @classmethod
@@ -119,6 +119,10 @@ class Surface:
         )
         self.table = packed([x for value in values for x in (value if dr.depth_v(value) > 1 else (value,))])
         return self
+
+    def for_lookups(self) -> Surface:
+        """These records for `interaction` at an index alone, at half of the memory."""
+        return Surface(table=self.table)
 
     def taken(self, index: JitArray) -> Surface:
         """The records of an index (mitsuba.UInt32)."""
