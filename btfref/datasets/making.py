@@ -102,7 +102,7 @@ def make(
         An unknown name or tier; a package of another version.
     """
     chosen, materials = sets.find(name)
-    size = chosen.tier(tier)
+    chosen.tier(tier)
     made = []
     for material in materials:
 
@@ -112,7 +112,7 @@ def make(
 
         where = place(folder, chosen, tier, material)
         means: dict[str, Any] = {"scheduler": scheduler, "workers": workers, "progress": tell}
-        _package(where, chosen, tier, size, material, overwrite, memory, means)
+        _package(where, chosen, tier, material, overwrite, memory, means)
         made.append(where)
     return made
 
@@ -133,7 +133,7 @@ def expected(chosen: DataSet, tier: str, material: Material, built: Mesostructur
         "mesostructure": material.mesostructure,
         "parameters": built.parameters,
         "geometry": fingerprint(built),
-        "settings": dataclasses.asdict(chosen.tier(tier)),
+        "settings": dataclasses.asdict(chosen.size(tier, material)),
         "seeds": {
             "grids": sets.GRID_SEED,
             "test": sets.TEST_SEED,
@@ -155,7 +155,6 @@ def _package(
     where: Path,
     chosen: DataSet,
     tier: str,
-    size: Tier,
     material: Material,
     overwrite: bool,
     memory: int | None,
@@ -174,6 +173,7 @@ def _package(
         for name in ("grids", "queries", "maps", "geometry"):
             (where / name).mkdir(exist_ok=True)
         write_geometry(built, where / "geometry")
+        size = chosen.size(tier, material)
         grids = _grids(where, size, built, memory, means)
         _queries(where, size, built, means)
         maps = _maps(where, size, built, means["progress"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from btfref.errors import InputError
@@ -26,6 +26,8 @@ class Material:
         What makes it hard, in words.
     parameters : dict
         Of the mesostructure; those not named have its defaults.
+    samples : int
+        Samples of its grids, in those of the tier: rare highlights and light that bounces many times are noisier.
     """
 
     name: str
@@ -33,6 +35,7 @@ class Material:
     kind: str
     difficulty: str
     parameters: Facts = field(default_factory=dict)
+    samples: int = 1
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,16 @@ class DataSet:
             raise InputError("unknown tier", field="tier", got=name[:40], expected=", ".join(self.tiers))
         return self.tiers[name]
 
+    def size(self, tier: str, material: Material) -> Tier:
+        """A tier as it is made of a material, with the samples that it takes.
+
+        Raises
+        ------
+        InputError
+        """
+        size = self.tier(tier)
+        return replace(size, spp=size.spp * material.samples)
+
 
 #: Seeds: of the grids, of the queries that nobody fits to (that of footprint k is the number + k), of training queries,
 #: and of the maps.
@@ -157,6 +170,7 @@ _MATERIALS = (
         "mail",
         "overhanging metal",
         "hard: metal under metal; silhouettes, holes, light that bounces many times.",
+        samples=8,
     ),
     Material(
         "pebbles",
@@ -169,6 +183,7 @@ _MATERIALS = (
         "flakes",
         "sparse",
         "hard: rare small mirrors; most samples see none, the mean is made by few.",
+        samples=2,
     ),
     Material(
         "specks",
@@ -189,7 +204,7 @@ _MATERIALS = (
         "medium: a plain weave with sheen; two colours that occlude each other.",
     ),
     Material("twill", "twill", "cloth", "medium: a diagonal of floats, dark warp over light weft."),
-    Material("satin", "satin", "cloth", "medium: long floats with strong anisotropic gloss."),
+    Material("satin", "satin", "cloth", "medium: long floats with strong anisotropic gloss.", samples=4),
     Material("knit", "knit", "cloth", "hard: loops that pass through loops; deep, with overhang."),
     Material(
         "pile",
