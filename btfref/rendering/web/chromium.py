@@ -16,7 +16,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from functools import cache
 from typing import Any
 
 from btfref.errors import BtfrefError, MissingDependencyError
@@ -44,6 +43,12 @@ FLAGS = (
 
 #: Seconds without an answer after which a browser counts as hanging.
 TIMEOUT = 300.0
+
+#: Longest message, bytes: after one of more than 100 MiB Chromium hears nothing any more, and does not say so.
+LONGEST = 96 << 20
+
+#: Characters of an expression's data that are said at a time.
+PIECE = 32 << 20
 
 #: Puts the two ends of the pipe where Chromium looks for them, then becomes it.
 _START = "import os, sys; a = sys.argv; os.dup2(int(a[1]), 3); os.dup2(int(a[2]), 4); os.execv(a[3], a[3:])"
@@ -75,6 +80,8 @@ class Browser:
             )
         self.timeout, self._last, self._rest = timeout, 0, b""
         self.events: list[Facts] = []
+        #: Whether an answer did not come in time: nobody knows what it is at.
+        self.silent = False
         self._crashed: set[str | None] = set()
         self._profile = tempfile.mkdtemp(prefix="btfref-chromium-")
         ours, theirs = _pipe(), _pipe()
@@ -109,6 +116,11 @@ class Browser:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed, or has ended."""
+        return self._write < 0 or self._process.poll() is not None
+
     def close(self) -> None:
         """End the browser and remove its profile; a second time does nothing."""
         if self._write < 0:
@@ -116,6 +128,8 @@ class Browser:
         os.close(self._write)
         os.close(self._read)
         self._write = self._read = -1
+        if self.silent:
+            self._process.kill()
         try:
             self._process.wait(10)
         except subprocess.TimeoutExpired:
@@ -139,8 +153,11 @@ class Browser:
         message: Facts = {"id": self._last, "method": method, "params": parameters or {}}
         if session is not None:
             message["sessionId"] = session
+        data = json.dumps(message).encode() + b"\0"
+        if len(data) > LONGEST:
+            raise BtfrefError(f"a message of {len(data)} bytes is too long for the browser; {method}")
         deadline = time.monotonic() + self.timeout
-        self._put(json.dumps(message).encode() + b"\0", method, deadline)
+        self._put(data, method, deadline)
         while True:
             answer = self._take(method, deadline)
             if answer.get("id") == self._last:
@@ -170,6 +187,7 @@ class Browser:
                 except BrokenPipeError as error:
                     raise BtfrefError(f"the browser ended; {method}") from error
             if time.monotonic() > deadline:
+                self.silent = True
                 raise BtfrefError(f"the browser took no message for {self.timeout:g} s; {method}")
 
     def _receive(self, method: str) -> None:
@@ -187,6 +205,7 @@ class Browser:
                 return json.loads(b"".join(parts))
             left = deadline - time.monotonic()
             if left <= 0 or not select.select([self._read], [], [], left)[0]:
+                self.silent = True
                 raise BtfrefError(f"no answer from the browser within {self.timeout:g} s; {method}")
             self._receive(method)
 
@@ -205,7 +224,7 @@ class Page:
     """
 
     def __init__(self, browser: Browser, url: str) -> None:
-        self.browser = browser
+        self.browser, self._given = browser, 0
         self._target = browser.send("Target.createTarget", {"url": "about:blank"})["targetId"]
         attached = browser.send("Target.attachToTarget", {"targetId": self._target, "flatten": True})
         self.session = attached["sessionId"]
@@ -259,6 +278,33 @@ class Page:
             raise BtfrefError(f"in the browser: {' '.join(str(said).splitlines()[0].split())}")
         return found["result"].get("value")
 
+    def given(self, value: object) -> str:
+        """An expression of JavaScript for a value of any size: what is large is said in pieces before.
+
+        Parameters
+        ----------
+        value
+            JSON-able.
+
+        Returns
+        -------
+        str
+            To be evaluated once.
+
+        Raises
+        ------
+        BtfrefError
+        """
+        text = json.dumps(value)
+        if len(text) <= PIECE:
+            return text
+        self._given += 1
+        name = f"btfrefGiven{self._given}"
+        self.evaluate(f"globalThis.{name} = []; 0")
+        for first in range(0, len(text), PIECE):
+            self.evaluate(f"{name}.push({json.dumps(text[first : first + PIECE])}); 0")
+        return f"JSON.parse({name}.splice(0).join(''))"
+
     def complaints(self) -> list[str]:
         """Errors and warnings of this page so far: of its console, of exceptions, of the browser's log."""
         said = []
@@ -285,9 +331,18 @@ def _pipe() -> tuple[int, int]:
     return found[0], found[1]
 
 
-@cache
+_shared: list[Browser] = []
+
+
 def shared() -> Browser:
-    """The process's browser, started when it is first asked for and closed with the process."""
-    browser = Browser()
-    atexit.register(browser.close)
-    return browser
+    """The process's browser, started when it is first asked for and closed with the process.
+
+    One that was closed, or did not answer in time, makes room for another.
+    """
+    if _shared and (_shared[0].silent or _shared[0].closed):
+        _shared.pop().close()
+    if not _shared:
+        browser = Browser()
+        atexit.register(browser.close)
+        _shared.append(browser)
+    return _shared[0]

@@ -70,7 +70,7 @@ class WebContext:
         """All commands so far, then one whose answer is wanted."""
         self.add(name, *arguments)
         commands, self._commands = self._commands, []
-        return self._page.evaluate(f"run({json.dumps(commands)})")
+        return self._page.evaluate(f"run({self._page.given(commands)})")
 
     def number(self) -> int:
         """A name for a new object."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -97,9 +96,10 @@ class WebProbe:
         self._own = where is None
         self._device = device() if where is None else where
         text = base64.b64encode(np.ascontiguousarray(rows, "<f4").tobytes()).decode("ascii")
-        self._do(f"globalThis.port = BtfPort.open(gl, {json.dumps(package.embedded())}); 0")
+        self._do("globalThis.port = BtfPort.open(gl, {}); 0", package.embedded())
         self._do(
-            f"globalThis.lookups = BtfPort.prepare(gl, port, new Float32Array(BtfPort.decode('{text}').buffer)); 0"
+            "globalThis.lookups = BtfPort.prepare(gl, port, new Float32Array(BtfPort.decode({}).buffer)); 0",
+            text,
         )
 
     def __enter__(self) -> WebProbe:
@@ -109,9 +109,13 @@ class WebProbe:
         if kind is None:
             self._do("BtfPort.release(lookups); BtfPort.close(gl, port); 0")
 
-    def _do(self, expression: str) -> Facts:
+    def _do(self, expression: str, value: object = None) -> Facts:
+        """The value of an expression; a pair of braces in it stands for a value."""
+        page = self._device.page
         try:
-            return self._device.page.evaluate(expression)
+            if value is not None:
+                expression = expression.replace("{}", page.given(value), 1)
+            return page.evaluate(expression)
         except BtfrefError:
             if self._own:
                 _kept().clear()

@@ -155,6 +155,48 @@ def test_a_browser_that_does_not_answer_or_ends_is_said(need):
         browser.send("Browser.getVersion")
 
 
+def test_what_is_long_is_said_in_pieces(browser, asked, monkeypatch):
+    _, package, points = asked
+    with Device(browser) as where:
+        whole = ask(package, points, where)
+    monkeypatch.setattr(chromium, "PIECE", 1000)
+    with Device(browser) as where:
+        assert np.array_equal(ask(package, points, where), whole)
+    text = ['ä"\\\n{}' * 999, {"b": [1.5, None]}]
+    with browser.page() as page:
+        one, other = page.given(text), page.given(text[:1])
+        assert page.evaluate(f"({one})") == text
+        assert page.evaluate(f"({other})") == text[:1]
+
+
+def test_no_message_makes_the_browser_deaf(browser, monkeypatch):
+    monkeypatch.setattr(chromium, "LONGEST", 10_000)
+    with browser.page() as page:
+        with pytest.raises(BtfrefError, match="too long for the browser"):
+            page.evaluate(f"'{'x' * 10_000}'")
+        assert page.evaluate("6 * 7") == 42
+
+
+def test_a_browser_that_was_silent_or_ended_is_replaced(need, monkeypatch):
+    need("chromium")
+    monkeypatch.setattr(chromium, "_shared", [])
+    first = chromium.shared()
+    assert chromium.shared() is first
+    first.timeout = 0.5
+    with first.page() as page, pytest.raises(BtfrefError, match="no answer"):
+        page.evaluate("new Promise(() => 0)")
+    second = chromium.shared()
+    assert second is not first
+    assert first.closed
+    with pytest.raises(BtfrefError, match="the browser ended"):
+        second.send("Browser.crash")
+    second._process.wait(30)
+    third = chromium.shared()
+    assert third is not second
+    assert third.send("Browser.getVersion")["product"] == third.version
+    third.close()
+
+
 def test_without_chromium_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setattr(chromium, "chromium", lambda: None)
     with pytest.raises(MissingDependencyError, match=r"apt-get install .*chromium"):
