@@ -10,7 +10,7 @@ from btfref.registry import methods
 
 #: Cases of the default run, and of the long one.
 FEW, MANY = 120, 10_000
-FEW_BYTES = 240
+FEW_BYTES = 440
 
 
 @pytest.fixture(scope="module")

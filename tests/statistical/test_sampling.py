@@ -107,18 +107,14 @@ def test_density_integrates_to_one(case, view, llvm, load_plugin):
     assert np.abs(integral - 1).max() <= tolerance("pdf.integral.max")
 
 
-#: Samples at each place whose weights are looked at.
-N_WEIGHED = 1 << 13
-
-
 @pytest.mark.parametrize("view", VIEWS)
 def test_weight_is_value_over_density(case, view, llvm, load_plugin, rng):
     """sample() returns eval/pdf and its own pdf(); eval_pdf() is the pair of both."""
     import drjit as dr
 
     mi = llvm
-    bsdf, context, n = load_plugin(case[0], **case[1]), mi.BSDFContext(), len(UVS) * N_WEIGHED
-    si = surface(mi, n, np.repeat(UVS, N_WEIGHED, 0).T, VIEWS[view])
+    bsdf, context, n = load_plugin(case[0], **case[1]), mi.BSDFContext(), len(UVS) << 15
+    si = surface(mi, n, np.repeat(UVS, 1 << 15, 0).T, VIEWS[view])
     bs, weight = bsdf.sample(
         context, si, to_device(mi.Float, rng.random(n)), to_device(mi.Point2f, rng.random((2, n)))
     )
@@ -131,7 +127,7 @@ def test_weight_is_value_over_density(case, view, llvm, load_plugin, rng):
     dr.eval(value, pdf, both)
     pdf = np.array(pdf)
     value, weight = np.array(value), np.array(weight)
-    scale = np.abs(value).reshape(3, len(UVS), -1).max((0, 2)).repeat(N_WEIGHED)
+    scale = np.abs(value).reshape(3, len(UVS), -1).max((0, 2)).repeat(1 << 15)
     assert (pdf > 0).all()
     assert (np.abs(np.array(bs.pdf) - pdf) <= tolerance("sample.pdf.max") * pdf).all()
     error = np.abs(weight * pdf - value)
@@ -142,7 +138,7 @@ def test_weight_is_value_over_density(case, view, llvm, load_plugin, rng):
     assert (np.array(bs.wo)[2] > 0).all()
 
 
-N_VARIANCE_TEXELS = 48
+N_VARIANCE_TEXELS = 96
 
 
 @pytest.mark.parametrize("case", [c for c in CASES if not c[2]], indirect=True, ids="-".join)

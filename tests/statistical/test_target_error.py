@@ -30,7 +30,7 @@ def tile():
     return Mesostructure("squares", {}, tuple(parts))
 
 
-@pytest.mark.parametrize(("estimator", "target"), [("path", 0.02), ("surface", 0.025)])
+@pytest.mark.parametrize(("estimator", "target"), [("path", 0.01), ("surface", 0.025)])
 def test_the_target_is_reached_with_honest_variance(tmp_path, tile, estimator, target):
     stores = [
         synthesize_store(
@@ -60,7 +60,7 @@ def test_the_target_is_reached_with_honest_variance(tmp_path, tile, estimator, t
 
 def test_samples_go_where_the_variance_is(tile, tmp_path):
     """Fewer samples than a uniform synthesis of the same error, most of them in the noisy texels."""
-    store = synthesize_store(tmp_path / "a.btf.zarr", tile, seed=3, target_error=0.02, **SETTINGS)
+    store = synthesize_store(tmp_path / "a.btf.zarr", tile, seed=3, target_error=0.01, **SETTINGS)
     facts = adaptive.summary(store)
     uniform = synthesize(tile, seed=4, spp=int(facts["samples"]["mean"]) // 2 * 2, **SETTINGS)
     error = np.sqrt(uniform.variance.mean(dtype=np.float64)) / uniform.values.mean(dtype=np.float64)

@@ -1,5 +1,7 @@
 """Light in spherical harmonics: GLSL against float64, and exact where the environment has few bands."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from probes import hemisphere
@@ -36,10 +38,13 @@ def brute_force(fits):
     """Some lookups, and ``integral(light)``: ∫ B(l) L(R l) dl there, with L a function of directions."""
     points = uv, w_view, frame = lookups(np.random.default_rng(20040601), 12)
     w, weight = gauss_hemisphere(64, 360)
-    value = fits("lpca").evaluate(uv[:, None], w, w_view[:, None])
+
+    @cache
+    def known():
+        return fits("lpca").evaluate(uv[:, None], w, w_view[:, None])
 
     def integral(light):
-        return np.einsum("l,nlc,nlc->nc", weight, value, light(np.einsum("nij,lj->nli", frame, w)))
+        return np.einsum("l,nlc,nlc->nc", weight, known(), light(np.einsum("nij,lj->nli", frame, w)))
 
     return points, integral
 
