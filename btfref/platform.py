@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -74,6 +75,12 @@ def find_llvm(patterns: Iterable[str] = _SEARCH) -> list[tuple[int, str]]:
     return sorted(found.values(), reverse=True)
 
 
+@cache
+def _installed_llvm() -> tuple[tuple[int, str], ...]:
+    """The libraries of this machine, looked for once: every render and fit asks."""
+    return tuple(find_llvm())
+
+
 def choose_llvm(
     environment: Mapping[str, str] | None = None, found: Sequence[tuple[int, str]] | None = None
 ) -> LLVMChoice:
@@ -91,7 +98,7 @@ def choose_llvm(
     LLVMChoice
     """
     given = (os.environ if environment is None else environment).get("DRJIT_LIBLLVM_PATH")
-    found = find_llvm() if found is None else found
+    found = _installed_llvm() if found is None else found
     refused = tuple(candidate for candidate in found if candidate[0] < MINIMUM_LLVM)
     passed_over = ""
     if given:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import cache
 
 __version__ = "0.2.0"
 
@@ -40,15 +41,22 @@ def versions(names: Iterable[str] = (*RELEVANT, LLVM)) -> dict[str, str | None]:
         ``btfref`` and ``python`` first, then `names` in their order.
     """
     import platform
-    from importlib import metadata
 
     found: dict[str, str | None] = {"btfref": __version__, "python": platform.python_version()}
     for name in names:
-        try:
-            found[name] = _llvm() if name == LLVM else metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = None
+        found[name] = _llvm() if name == LLVM else _installed(name)
     return found
+
+
+@cache  # of a process: every artefact asks, and what is imported stays
+def _installed(name: str) -> str | None:
+    """Version of a distribution."""
+    from importlib import metadata
+
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
 
 
 def _llvm() -> str | None:

@@ -30,8 +30,9 @@ CHUNK = 1 << 14
 #: Pairs of directions in the stencils of a lookup, at most.
 PAIRS = 16
 
-#: Values that lookups gather at a time from tables with many entries: 160 MiB in float64.
-GATHERED = 20 << 20
+#: Values that lookups gather at a time from tables with many entries: 8 MiB in float64. Larger ones are no faster, but
+#: slower: their memory is new each time, and out of the cache.
+GATHERED = 1 << 20
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ Conventions (Mitsuba 3.9, ``src/emitters/envmap.cpp``), in the emitter's own fra
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Literal
@@ -29,6 +30,10 @@ SUN_APERTURE = 0.5358
 
 #: Rows of the cells that stand for a picture of any size when it is filtered: 1.4 degrees a cell.
 CELL_ROWS = 128
+
+#: Environments whose cells are kept, by content: each way to light asks for the same ones. At most 25 MB.
+KEPT = 4
+_CELLS: dict[tuple[object, ...], tuple[np.ndarray, np.ndarray]] = {}
 
 
 @dataclass(frozen=True)
@@ -117,9 +122,22 @@ class Environment:
             Unit vectors towards the lights, world space.
         power : ndarray of float64, shape (2 rows², 3)
             Radiance times solid angle: irradiance perpendicular to ``w``. Sums over the sphere are exact for
-            a constant environment.
+            a constant environment. Both are shared, and not to be changed.
         """
         rows = rows or CELL_ROWS
+        digest = hashlib.blake2b(np.ascontiguousarray(self.radiance).data, digest_size=16)
+        digest.update(np.ascontiguousarray(self.to_world, float).data)
+        key = (digest.digest(), self.radiance.dtype.str, self.radiance.shape, rows)
+        if key not in _CELLS:
+            made = self._integrated(rows)
+            for array in made:
+                array.flags.writeable = False  # remembered
+            while len(_CELLS) >= KEPT:
+                _CELLS.pop(next(iter(_CELLS)))
+            _CELLS[key] = made
+        return _CELLS[key]
+
+    def _integrated(self, rows: int) -> tuple[np.ndarray, np.ndarray]:
         height, width = self.radiance.shape[:2]
         # Breakpoints of the bilinear interpolant fall on borders of the fine grid, where the rule is of second order.
         n_v = (height - 1) * max(2, -(-2 * rows // (height - 1)))

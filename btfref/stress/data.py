@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -126,7 +127,14 @@ def _duplicates(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _relief(seed: int) -> SampledBTF:
-    """Data that a height field explains: a g-BRDF of smooth bumps 0.1 deep, in two materials, at all its samples."""
+    """Data that a height field explains, whatever the seed."""
+    chosen = directions("ubo81")
+    return SampledBTF(_relief_values().copy(), chosen, chosen, attributes={"mesostructure": "formula"})
+
+
+@cache  # six seconds, for every method
+def _relief_values() -> np.ndarray:
+    """A g-BRDF of smooth bumps 0.1 deep, in two materials, at all its samples."""
     from btfref.numerics.microfacets import isotropic_ndf
     from btfref.representations.gbrdf.build import from_maps
 
@@ -144,8 +152,7 @@ def _relief(seed: int) -> SampledBTF:
     )
     chosen = directions("ubo81")
     uv, lights = np.stack([u, v], -1), chosen.vectors[:, None, None]
-    values = np.stack([surface.evaluate(uv, lights, view) for view in chosen.vectors]).astype(np.float32)
-    return SampledBTF(values, chosen, chosen, attributes={"mesostructure": "formula"})
+    return np.stack([surface.evaluate(uv, lights, view) for view in chosen.vectors]).astype(np.float32)
 
 
 def scattered(seed: int, n: int = 40) -> np.ndarray:

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 #: Random points of the box of rounded arguments among which a differing value is looked for.
 NEIGHBOURS = 256
 
+#: Of these evaluated in one call: single lookups cost a call each, and little else.
+TOGETHER = 1 << 13
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -156,6 +159,7 @@ def port_agreement(
     lod: ArrayLike = 0.0,
     *,
     gate: str = "probe.agreement",
+    reference: np.ndarray | None = None,
 ) -> Comparison:
     """A port's values against the definition's, by the distribution of their relative error.
 
@@ -171,12 +175,15 @@ def port_agreement(
     lod : array_like
     gate : str
         Key of ``tolerances.toml``.
+    reference : ndarray, shape (n, 3), optional
+        The definition's values, where they are known: several ports may be judged by one evaluation.
 
     Returns
     -------
     Comparison
     """
-    reference = representation.evaluate(*points, lod=lod)
+    if reference is None:
+        reference = representation.evaluate(*points, lod=lod)
     allowance = None
     if isinstance(representation, Spreads):
         size = np.abs(reference).max(-1, keepdims=True)
@@ -212,15 +219,20 @@ def rounded_range(
     uv = np.where(np.isfinite(uv), uv, 0.0)
     # A tile far out is a tile: its own rounding is in the argument already, which is exact.
     low = high = representation.evaluate(uv, w_light, w_view, lod=lookups.lod)
-    for _ in range(neighbours):
+    together = max(1, TOGETHER // max(1, len(uv)))
+    for first in range(0, neighbours, together):
         # Sizes over many decades: next to the horizon a change of the last digit turns a ray as far as one of the
         # first.
         moved = [
-            a + step * 10 ** rng.uniform(-8, 0, a.shape) * rng.choice([-1.0, 1.0], a.shape)
-            for a in (uv - np.floor(uv), w_light, w_view)
+            [
+                a + step * 10 ** rng.uniform(-8, 0, a.shape) * rng.choice([-1.0, 1.0], a.shape)
+                for a in (uv - np.floor(uv), w_light, w_view)
+            ]
+            for _ in range(first, min(first + together, neighbours))
         ]
-        for w in moved[1:]:
-            w[:, 2] = np.maximum(w[:, 2], 2.0**-126)
-        value = representation.evaluate(*moved, lod=lookups.lod)
-        low, high = np.minimum(low, value), np.maximum(high, value)
+        points = [np.stack(a) for a in zip(*moved, strict=True)]
+        for w in points[1:]:
+            w[..., 2] = np.maximum(w[..., 2], 2.0**-126)
+        value = representation.evaluate(*points, lod=lookups.lod)
+        low, high = np.minimum(low, value.min(0)), np.maximum(high, value.max(0))
     return low, high

@@ -65,9 +65,10 @@ def probe_gates(path: PathLike, *, seed: int = 7) -> list[GateResult]:
     representation = load(path)
     lookups = hard_lookups(np.random.default_rng(seed), representation, PROBES, USUAL)
     gates, bad = [], 0
+    reference = representation.evaluate(*lookups.points, lod=lookups.lod)
     for name in present(PORTS):
         value = evaluator(name, representation, path).evaluate(*lookups.points, lod=lookups.lod)
-        found = port_agreement(value, representation, lookups.points, lookups.lod)
+        found = port_agreement(value, representation, lookups.points, lookups.lod, reference=reference)
         gates += [gate.named(EVALUATORS[name].title) for gate in found.gates]
         bad += int(np.count_nonzero(~np.isfinite(value)))
     return gates + judge("probe.finite", {"nonfinite": Measured(bad)})

@@ -9,7 +9,7 @@ import pytest
 from btfref.registry import methods
 
 #: Cases of the default run, and of the long one.
-FEW, MANY = 220, 10_000
+FEW, MANY = 120, 10_000
 FEW_BYTES = 440
 
 

@@ -190,16 +190,19 @@ class TriangleInterpolation:
         n = len(self.cells)
         cell = np.clip(((square + 1) * (0.5 * n)).astype(np.int64), 0, n - 1)
         current = np.asarray(self.cells)[cell[..., 1], cell[..., 0]].astype(np.int64)
+        flat, points = current.reshape(-1), np.broadcast_to(w, (*current.shape, 3)).reshape(-1, 3)
+        # Most are where they start: only those that have to move go on.
+        moving = np.arange(len(flat))
         for _ in range(len(table)):
-            row = table[current]
-            coordinates = barycentric(row, w)
-            worst = np.argmin(coordinates, -1)
-            outside = np.take_along_axis(coordinates, worst[..., None], -1)[..., 0] < -1e-12
-            if not outside.any():
+            row = table[flat[moving]]
+            coordinates = barycentric(row, points[moving])
+            worst = np.argmin(coordinates, -1)[:, None]
+            outside = np.take_along_axis(coordinates, worst, -1)[:, 0] < -1e-12
+            moving = moving[outside]
+            if not len(moving):
                 break
-            across = np.take_along_axis(row[..., 18:21], worst[..., None], -1)[..., 0].astype(np.int64)
-            current = np.where(outside, across, current)
-        return current
+            flat[moving] = np.take_along_axis(row[outside, 18:21], worst[outside], -1)[:, 0].astype(np.int64)
+        return flat.reshape(current.shape)
 
     def stencil(
         self, w: ArrayLike, *, hold: bool = True, draw: ArrayLike | None = None

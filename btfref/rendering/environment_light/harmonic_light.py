@@ -8,6 +8,7 @@ integrated, not the measured samples alone, whose quadrature is exact for two ba
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -115,15 +116,25 @@ def light_projection(representation: Representation, order: int) -> np.ndarray:
     Returns
     -------
     ndarray of float64, shape (order², n_lights)
+        Shared, and not to be changed.
     """
-    arrays = representation.arrays()
-    lights = interpolation.from_arrays(arrays, "light")
+    tables = {name: table for name, table in representation.arrays().items() if name.startswith("light_")}
+    content = tuple((name, a.dtype.str, a.shape, a.tobytes()) for name, a in sorted(tables.items()))
+    return _projection(content, order)
+
+
+@lru_cache(maxsize=8)
+def _projection(content: tuple[tuple[str, str, tuple[int, ...], bytes], ...], order: int) -> np.ndarray:
+    """The same of tables by content: materials share their sets of lights."""
+    tables = {name: np.frombuffer(data, dtype).reshape(shape) for name, dtype, shape, data in content}
     w, weight = gauss_hemisphere(*NODES)
-    index, share = lights.stencil(w, hold=False)
+    index, share = interpolation.from_arrays(tables, "light").stencil(w, hold=False)
     weighted = harmonics.values(w, order) * weight[:, None]
-    n = len(arrays["light_directions"])
+    n = len(tables["light_directions"])
     flat = index.ravel()
-    return np.stack([np.bincount(flat, (share * y[:, None]).ravel(), n) for y in weighted.T])
+    found = np.stack([np.bincount(flat, (share * y[:, None]).ravel(), n) for y in weighted.T])
+    found.flags.writeable = False  # remembered
+    return found
 
 
 def table_coefficients(

@@ -92,8 +92,8 @@ def lobe_maps(environment: Environment | Cells, *, size: int = SIZE, slices: int
                 result[i, part] = chain[i % 2] @ power
                 if i + 2 < slices:
                     np.multiply(chain[i % 2], chain[i % 2], out=chain[i % 2])
-                    # Subnormal numbers are slow and count for nothing.
-                    chain[i % 2][chain[i % 2] < 1e-18] = 0
+                    # Subnormal numbers are slow and count for nothing; a product is faster than an assignment by mask.
+                    np.multiply(chain[i % 2], chain[i % 2] >= 1e-18, out=chain[i % 2])
     result *= ((exponents(slices) + 1) / (2 * np.pi))[:, None, None].astype(np.float32)
     return result.reshape(2 * slices, size, size, 3)
 
@@ -206,7 +206,7 @@ def clipped_lobes(edge: float, *, cosine: bool, slices: int = CLIPPED, heights: 
     for i, n in enumerate(exponents(slices)):
         total, along, beside = np.moveaxis(chain[i % 2] @ means, -1, 0)
         if i + 2 < slices:
-            chain[i % 2][chain[i % 2] < SMALLEST] = 0
+            np.multiply(chain[i % 2], chain[i % 2] >= SMALLEST, out=chain[i % 2])
             np.multiply(chain[i % 2], chain[i % 2], out=chain[i % 2])
         integral = total @ weight
         up, across = total @ (weight * z), along @ (weight * sine)

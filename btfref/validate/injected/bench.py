@@ -316,9 +316,11 @@ class Bench:
         if isinstance(brighter, DrJit):
             brighter.plugin.evaluator = _BrighterPort(brighter.plugin.evaluator)
         found: list[GateResult] = []
+        reference = representation.evaluate(*lookups.points, lod=lookups.lod)
         for port in made.values():
             value = port.evaluate(*lookups.points, lod=lookups.lod)
-            found += port_agreement(value, representation, lookups.points, lookups.lod).gates
+            agreed = port_agreement(value, representation, lookups.points, lookups.lod, reference=reference)
+            found += agreed.gates
         return found
 
     def harmonics(self, subject: Subject) -> Gates:

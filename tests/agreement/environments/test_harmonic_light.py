@@ -1,5 +1,7 @@
 """Light in spherical harmonics: GLSL against float64, and exact where the environment has few bands."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from probes import hemisphere
@@ -31,11 +33,20 @@ def lookups(rng, n, *, mirrored=True):
     return rng.uniform(-1, 2, (n, 2)).astype(np.float32), hemisphere(rng, n), frame.astype(np.float32)
 
 
-def rotated_definition(rep, light, uv, w_view, frame):
-    """∫ B(l) L(R l) dl by brute force, with L a function of directions."""
+@pytest.fixture(scope="module")
+def brute_force(fits):
+    """Some lookups, and ``integral(light)``: ∫ B(l) L(R l) dl there, with L a function of directions."""
+    points = uv, w_view, frame = lookups(np.random.default_rng(20040601), 12)
     w, weight = gauss_hemisphere(64, 360)
-    value = rep.evaluate(uv[:, None], w, w_view[:, None])
-    return np.einsum("l,nlc,nlc->nc", weight, value, light(np.einsum("nij,lj->nli", frame, w)))
+
+    @cache
+    def known():
+        return fits("lpca").evaluate(uv[:, None], w, w_view[:, None])
+
+    def integral(light):
+        return np.einsum("l,nlc,nlc->nc", weight, known(), light(np.einsum("nij,lj->nli", frame, w)))
+
+    return points, integral
 
 
 @pytest.mark.parametrize(
@@ -61,12 +72,12 @@ def test_coefficients_of_a_known_environment():
     assert np.abs(found[len(known) :]).max() <= tolerance("environment.harmonics.max") * scale
 
 
-def test_an_environment_of_few_bands_is_exact(fits, rng):
+def test_an_environment_of_few_bands_is_exact(fits, brute_force):
     """The tables' own bands do not matter: what the light lacks is orthogonal to them."""
     rep, (environment, known) = fits("lpca"), harmonic_environment()
     order = int(np.sqrt(len(known)))
-    points = lookups(rng, 24)
-    truth = rotated_definition(rep, lambda w: values(w, order) @ known, *points)
+    points, integral = brute_force
+    truth = integral(lambda w: values(w, order) @ known)
     for bands in (order, order + 3):
         light = Lighting(environment, "sh", order=bands).prepared(rep)
         difference = np.abs(light.radiance(*points) - truth).max()
@@ -77,9 +88,9 @@ def test_an_environment_of_few_bands_is_exact(fits, rng):
     assert difference > 10 * tolerance("environment.harmonics.max") * truth.max()
 
 
-def test_a_constant_environment_is_the_albedo(fits, rng):
-    rep, points = fits("lpca"), lookups(rng, 24)
-    truth = rotated_definition(rep, lambda w: np.ones((*w.shape[:-1], 3)), *points)
+def test_a_constant_environment_is_the_albedo(fits, brute_force):
+    rep, (points, integral) = fits("lpca"), brute_force
+    truth = integral(lambda w: np.ones((*w.shape[:-1], 3)))
     light = Lighting(constant(), "sh", order=1).prepared(rep)
     assert np.abs(light.radiance(*points) - truth).max() <= tolerance("environment.furnace.max") * truth.max()
 

@@ -89,7 +89,7 @@ def test_lobes_of_a_small_light_are_powers_of_cosines(rng):
 def test_lobes_of_a_sky_are_its_integrals(rng, monkeypatch):
     monkeypatch.setattr("btfref.scene.environment.CELL_ROWS", 64)
     environment = sky(rng)
-    w, weight = sphere()
+    w, weight = sphere(100, 400)
     radiance = environment.evaluate(w) * weight[:, None]
     maps = prefilter.lobe_maps(environment)
     axis = random_directions(rng, 30)

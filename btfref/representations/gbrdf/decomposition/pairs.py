@@ -109,14 +109,17 @@ def shifted(image: np.ndarray, offset: ArrayLike) -> np.ndarray:
         Bilinear between texels.
     """
     result = np.zeros_like(image)
-    size = image.shape[::-1]
-    whole = np.floor(np.asarray(offset) * size).astype(int)
-    fx, fy = np.asarray(offset) * size - whole
+    rows, columns = image.shape
+    whole = np.floor(np.asarray(offset) * (columns, rows)).astype(int)
+    fx, fy = np.asarray(offset) * (columns, rows) - whole
+    # A row and a column more: the four neighbours are parts of one copy.
+    row, column = (np.arange(rows + 1) + whole[1]) % rows, (np.arange(columns + 1) + whole[0]) % columns
+    moved = image[row[:, None], column]
     for dy, wy in ((0, 1 - fy), (1, fy)):
         for dx, wx in ((0, 1 - fx), (1, fx)):
             if wx * wy > 0:
-                moved = np.roll(image, (-whole[1] - dy, -whole[0] - dx), (0, 1))
-                result += np.asarray(wx * wy, image.dtype) * moved
+                part = moved[dy : dy + rows, dx : dx + columns]
+                result += np.asarray(wx * wy, image.dtype) * part
     return result
 
 
