@@ -207,6 +207,12 @@ class Bench:
         image = webgl(scene, parameters=parameters, shadows=False, **SETTINGS).image
         return browser_gates(image, expected, classes)
 
+    def browser_environment(self, subject: Subject) -> Gates:
+        """Real time under an environment in a browser against float64."""
+        from btfref.validate.stages.browser import environment_gates
+
+        return environment_gates(self.fit(subject)[1], 1)
+
     def environment(self, subject: Subject, change: str = "") -> Gates:
         """Real time under an environment against a converged reference."""
         from btfref.rendering.gl.realtime import realtime

@@ -1,4 +1,8 @@
-"""The picture of real time drawn once more, by WebGL 2 in a headless Chromium: where there is one."""
+"""The picture of real time drawn once more, by WebGL 2 in a headless Chromium: where there is one.
+
+Under delta lights it is a picture of a cell, beside the one of real time. Under an environment real time approximates:
+there a small picture of each method is judged against the same approximation in float64.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +20,22 @@ if TYPE_CHECKING:
 
     from btfref.gates.verdicts import GateResult
     from btfref.rendering import RenderResult
-    from btfref.types import Facts
+    from btfref.representations.protocol import Representation
+    from btfref.types import Facts, PathLike
     from btfref.validate.matrix import Settings
 
 #: Gates of such a picture against the reference: its rasterizer is coarser than OpenGL's.
 GATES = ("image.browser", "image.browser_edges", "image.background")
+
+#: Gates of a picture under an environment against float64.
+ENVIRONMENT_GATES = ("image.browser_environment",)
+
+#: That picture: a scene, its environment (of few bands, so that harmonics have all of it), samples and size.
+SCENE, ENVIRONMENT = "sphere", "harmonics"
+PICTURE: Facts = {"grid": 1, "size": (24, 24)}
+
+#: Ways in which an environment lights, and what keeps them quick. Float64 says what each of them should show.
+WAYS: dict[str, Facts] = {"prefiltered": {}, "sh": {"order": 3}, "lights": {"lights": 24}}
 
 #: Name of the renderer in gates and tables.
 TITLE = "WebGL 2"
@@ -65,6 +80,59 @@ def browser_picture(path: Path, lights: str, settings: Settings, shared: Facts) 
     from btfref.rendering.web.context import webgl
 
     return webgl(path, shadows=False, **shared)
+
+
+def environment_ways(representation: Representation) -> list[str]:
+    """Ways in which an environment lights a representation: what few methods have comes first."""
+    from btfref.registry import methods
+    from btfref.representations.protocol import LitByHarmonics
+
+    row = methods().get(representation.meta["method"])
+    having = {
+        "prefiltered": row is not None and bool(row.image_light),
+        "sh": isinstance(representation, LitByHarmonics),
+        "lights": True,
+    }
+    return [way for way in WAYS if having[way]]
+
+
+def environment_gates(file: PathLike, most: int) -> list[GateResult]:
+    """A method's small picture under an environment against float64, in each of the ways; none without Chromium.
+
+    Parameters
+    ----------
+    file : path-like
+        A representation.
+    most : int
+        Ways at most; 0 draws nothing.
+
+    Returns
+    -------
+    list of GateResult
+        ``image.browser_environment`` of each way; the detail says which.
+
+    Raises
+    ------
+    BtfrefError
+        For a lost device, a blank frame or a missing extension.
+    """
+    if not most or chromium() is None:
+        return []
+    from btfref.rendering.offline.approximate import approximate
+    from btfref.rendering.web.context import webgl
+    from btfref.representations import load
+    from btfref.scene.pixel_classes import pixel_classes
+    from btfref.scene.shipped import scene_file
+
+    parameters = {"btf": str(file), "lights": "envmap", "environment": ENVIRONMENT, "tiling": "4"}
+    scene, shared = scene_file(SCENE), {"parameters": parameters, **PICTURE}
+    classes, found = pixel_classes(scene, **shared), []
+    for way in environment_ways(load(file))[:most]:
+        image = webgl(scene, environment=way, **shared, **WAYS[way]).image
+        exact = approximate(scene, path=way, **shared, **WAYS[way]).image
+        compared = compare(image, exact, classes=classes, gate=ENVIRONMENT_GATES, flip=False)
+        found += [gate.named(f"{TITLE}, {way}") for gate in compared.gates]
+    return found
 
 
 def browser_gates(image: np.ndarray, reference: np.ndarray, classes: np.ndarray) -> list[GateResult]:
