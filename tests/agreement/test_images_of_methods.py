@@ -128,9 +128,10 @@ def test_one_picture_of_each_method_in_the_browser(reference, need, key):
 @pytest.mark.long
 @pytest.mark.parametrize("lights", LIGHTS)
 @pytest.mark.parametrize("name", SCENES)
-def test_every_scene_in_the_browser(reference, need, name, lights):
+@pytest.mark.parametrize("key", methods())
+def test_every_scene_of_each_method_in_the_browser(reference, need, key, name, lights):
     need("chromium")
-    assert_same_picture(reference, FIRST, name, lights, LONG, **IN_BROWSER)
+    assert_same_picture(reference, key, name, lights, LONG, **IN_BROWSER)
 
 
 @pytest.mark.parametrize("lights", LIGHTS)

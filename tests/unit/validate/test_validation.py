@@ -152,6 +152,16 @@ def test_another_browser_makes_other_keys(tmp_path, monkeypatch):
     assert drawn.driver().endswith("Chromium 157.0")
 
 
+def test_ways_of_environments_in_the_browser(fits, monkeypatch):
+    """What few methods have comes first: the quick run draws that one alone."""
+    assert 0 < QUICK.browser_ways < FULL.browser_ways == len(browser.WAYS)
+    found = {key: browser.environment_ways(fits(key)) for key in ("lpca", "rf_poly", "raw")}
+    assert found == {"lpca": ["sh", "lights"], "rf_poly": ["prefiltered", "lights"], "raw": ["lights"]}
+    assert browser.environment_gates(fits.path("raw"), 0) == []
+    monkeypatch.setattr(browser, "chromium", lambda: None)
+    assert browser.environment_gates(fits.path("raw"), 1) == []
+
+
 def test_without_a_browser_its_pictures_are_left_out_or_demanded(monkeypatch):
     lights = QUICK.browser_lights[0]
     assert set(QUICK.browser_lights) < set(FULL.browser_lights)
