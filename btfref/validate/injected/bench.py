@@ -25,6 +25,7 @@ from btfref.stress.judging import port_agreement
 from btfref.stress.lookups import USUAL, hard_lookups, hemisphere
 from btfref.types import Facts
 from btfref.validate.cell import ENVIRONMENT_GATES, GATES, STRICT
+from btfref.validate.matrix import QUICK
 from btfref.validate.method_gates import sampling_gates
 from btfref.validate.own_renderer import EIGHT_BIT, NOISY
 
@@ -211,7 +212,7 @@ class Bench:
         """Real time under an environment in a browser against float64."""
         from btfref.validate.stages.browser import environment_gates
 
-        return environment_gates(self.fit(subject)[1], 1)
+        return environment_gates(self.fit(subject)[1], QUICK.browser_ways)
 
     def environment(self, subject: Subject, change: str = "") -> Gates:
         """Real time under an environment against a converged reference."""

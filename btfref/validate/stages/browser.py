@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -87,7 +88,7 @@ def browser_picture(path: Path, lights: str, settings: Settings, shared: Facts) 
 
 
 def environment_ways(representation: Representation) -> list[str]:
-    """Ways in which an environment lights a representation: what few methods have comes first."""
+    """Ways in which an environment lights a representation."""
     from btfref.registry import methods
     from btfref.representations.protocol import LitByHarmonics
 
@@ -100,27 +101,27 @@ def environment_ways(representation: Representation) -> list[str]:
     return [way for way in WAYS if having[way]]
 
 
-def environment_gates(file: PathLike, most: int) -> list[GateResult]:
-    """A method's small picture under an environment against float64, in each of the ways; none without Chromium.
+def environment_gates(file: PathLike, wanted: Sequence[str]) -> list[GateResult]:
+    """A method's small picture under an environment against float64, in those of some ways that it has.
 
     Parameters
     ----------
     file : path-like
         A representation.
-    most : int
-        Ways at most; 0 draws nothing.
+    wanted : sequence of str
+        Some of :data:`WAYS`.
 
     Returns
     -------
     list of GateResult
-        ``image.browser_environment`` of each way; the detail says which.
+        ``image.browser_environment`` of each way; the detail says which. Empty without Chromium.
 
     Raises
     ------
     BtfrefError
         For a lost device, a blank frame or a missing extension.
     """
-    if not most or chromium() is None:
+    if not wanted or chromium() is None:
         return []
     from btfref.images import save_image
     from btfref.rendering.offline.approximate import approximate
@@ -130,6 +131,9 @@ def environment_gates(file: PathLike, most: int) -> list[GateResult]:
     from btfref.scene.shipped import scene_file
 
     found: list[GateResult] = []
+    ways = [way for way in environment_ways(load(file)) if way in wanted]
+    if not ways:
+        return found
     with tempfile.TemporaryDirectory() as folder:
         room = Path(folder) / "window.exr"
         radiance = np.zeros((*ROOM, 3), np.float32)
@@ -138,7 +142,7 @@ def environment_gates(file: PathLike, most: int) -> list[GateResult]:
         parameters = {"btf": str(file), "lights": "envmap", "environment": str(room), "tiling": "4"}
         scene, shared = scene_file(SCENE), {"parameters": parameters, **PICTURE}
         classes = pixel_classes(scene, **shared)
-        for way in environment_ways(load(file))[:most]:
+        for way in ways:
             image = webgl(scene, environment=way, **shared, **WAYS[way]).image
             exact = approximate(scene, path=way, **shared, **WAYS[way]).image
             compared = compare(image, exact, classes=classes, gate=ENVIRONMENT_GATES, flip=False)

@@ -153,13 +153,13 @@ def test_another_browser_makes_other_keys(tmp_path, monkeypatch):
 
 
 def test_ways_of_environments_in_the_browser(fits, monkeypatch):
-    """What few methods have comes first: the quick run draws that one alone."""
-    assert 0 < QUICK.browser_ways < FULL.browser_ways == len(browser.WAYS)
+    """The quick run draws none of those that are sums over lights alone: they have pictures under lights."""
+    assert tuple(browser.WAYS) == FULL.browser_ways == (*QUICK.browser_ways, "lights")
     found = {key: browser.environment_ways(fits(key)) for key in ("lpca", "rf_poly", "raw")}
     assert found == {"lpca": ["sh", "lights"], "rf_poly": ["prefiltered", "lights"], "raw": ["lights"]}
-    assert browser.environment_gates(fits.path("raw"), 0) == []
+    assert browser.environment_gates(fits.path("raw"), QUICK.browser_ways) == []
     monkeypatch.setattr(browser, "chromium", lambda: None)
-    assert browser.environment_gates(fits.path("raw"), 1) == []
+    assert browser.environment_gates(fits.path("lpca"), QUICK.browser_ways) == []
 
 
 def test_without_a_browser_its_pictures_are_left_out_or_demanded(monkeypatch):
