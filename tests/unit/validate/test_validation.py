@@ -162,6 +162,20 @@ def test_ways_of_environments_in_the_browser(fits, monkeypatch):
     assert browser.environment_gates(fits.path("lpca"), QUICK.browser_ways) == []
 
 
+def test_background_beside_a_surface_is_a_silhouette_in_the_browser():
+    classes = np.full((5, 6), PixelClass.BACKGROUND, np.uint8)
+    classes[0, 0] = classes[0, 1] = PixelClass.INTERIOR
+    found = browser.browser_classes(classes)
+    assert found.dtype == classes.dtype
+    assert (found[0, :2] == PixelClass.INTERIOR).all()
+    assert {tuple(at) for at in np.argwhere(found == PixelClass.SILHOUETTE)} == {
+        (0, 2),
+        (1, 0),
+        (1, 1),
+        (1, 2),
+    }
+
+
 def test_without_a_browser_its_pictures_are_left_out_or_demanded(monkeypatch):
     lights = QUICK.browser_lights[0]
     assert set(QUICK.browser_lights) < set(FULL.browser_lights)
