@@ -31,7 +31,22 @@ CAPABILITIES = {
     "pyarrow": lambda: importlib.util.find_spec("pyarrow"),
     "llvm": lambda: _llvm(),
     "gl": lambda: _gl(),
+    "wgpu": lambda: importlib.util.find_spec("wgpu") and _vulkan(),
 }
+
+#: Where Chromium keeps a device of Vulkan that needs no GPU, and the loader that finds it.
+SWIFTSHADER = ("/usr/lib/chromium", "/usr/lib/chromium-browser", "/opt/google/chrome")
+
+
+def _vulkan():
+    """Variables under which a program finds a device of Vulkan without a GPU: Chromium's, or Mesa's."""
+    for folder in map(Path, SWIFTSHADER):
+        if (folder / "vk_swiftshader_icd.json").exists():
+            icd = str(folder / "vk_swiftshader_icd.json")
+            return {"VK_ICD_FILENAMES": icd, "LD_LIBRARY_PATH": str(folder)}
+    for path in Path("/usr/share/vulkan/icd.d").glob("lvp_icd*.json"):
+        return {"VK_ICD_FILENAMES": str(path)}
+    return None
 
 
 @functools.cache

@@ -89,6 +89,8 @@ class Settings:
         Samples per pixel of the path-traced sampled BTF under an environment, in four batches.
     browser_lights : tuple of str
         Delta lights under which the browser draws the pictures as well.
+    browser_ways : tuple of str
+        Ways to light by an environment in which the browser draws a small picture of each method that has them.
     port_pixels : int
         Pixels at which the approximation under an environment is evaluated in float64.
     off_grid_rows, off_grid_spp : int
@@ -110,6 +112,7 @@ class Settings:
     truth_spp: int = 128
     environment_spp: int = 1024
     browser_lights: tuple[str, ...] = DELTA
+    browser_ways: tuple[str, ...] = ("prefiltered", "sh", "lights")
     port_pixels: int = 64
     off_grid_rows: int = 20_000
     off_grid_spp: int = 64
@@ -137,7 +140,9 @@ QUICK = replace(
     size=48,
     environment_size=40,
     truth_spp=192,
-    browser_lights=("directional3",),
+    # SwiftShader takes long: one light on the plane, and a curved surface under what only some methods have.
+    browser_lights=("directional1",),
+    browser_ways=("prefiltered", "sh"),
     off_grid_rows=500,
     off_grid_spp=32,
     chi2_samples=200_000,

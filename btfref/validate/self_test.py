@@ -106,7 +106,7 @@ def self_test(*, edits: Sequence[Edit] = EDITS, progress: Progress | None = None
 
 def possible() -> tuple[Fault, ...]:
     """Those of `FAULTS` that this machine can look for: pictures of a browser need Chromium."""
-    return tuple(fault for fault in FAULTS if fault.look != "browser" or chromium() is not None)
+    return tuple(fault for fault in FAULTS if not fault.look.startswith("browser") or chromium() is not None)
 
 
 def edit_test(edits: Sequence[Edit] = EDITS) -> Iterator[Caught]:
@@ -201,7 +201,7 @@ def used_gates() -> set[str]:
     from btfref.validate.stages import browser
 
     keys = {"image.finite", "waterfall.closure", "environment.agreement", *cell.GATES, *method_gates.GATES}
-    keys.update(*cell.ENVIRONMENT_GATES.values(), browser.GATES)
+    keys.update(*cell.ENVIRONMENT_GATES.values(), browser.GATES, browser.ENVIRONMENT_GATES)
     return keys.union(own_renderer.LINEAR, own_renderer.EIGHT_BIT, own_renderer.NOISY)
 
 

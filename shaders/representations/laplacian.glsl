@@ -25,7 +25,12 @@ uniform sampler2DArray mean;
 #ifndef FIRST_LEVEL
 #define FIRST_LEVEL 0
 #endif
-const int BASE_LEVEL = FIRST_LEVEL < N_LEVELS ? FIRST_LEVEL : N_LEVELS - 1;
+// By the preprocessor: naga knows no constants that choose.
+#if FIRST_LEVEL < N_LEVELS
+const int BASE_LEVEL = FIRST_LEVEL;
+#else
+const int BASE_LEVEL = N_LEVELS - 1;
+#endif
 
 const int LEVEL_ROW_TABLE[N_LEVELS] = LEVEL_ROWS;
 const int LEVEL_COLUMN_TABLE[N_LEVELS] = LEVEL_COLUMNS;

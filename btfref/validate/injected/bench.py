@@ -25,6 +25,7 @@ from btfref.stress.judging import port_agreement
 from btfref.stress.lookups import USUAL, hard_lookups, hemisphere
 from btfref.types import Facts
 from btfref.validate.cell import ENVIRONMENT_GATES, GATES, STRICT
+from btfref.validate.matrix import QUICK
 from btfref.validate.method_gates import sampling_gates
 from btfref.validate.own_renderer import EIGHT_BIT, NOISY
 
@@ -206,6 +207,12 @@ class Bench:
         scene, parameters, expected, classes = self.reference(subject)
         image = webgl(scene, parameters=parameters, shadows=False, **SETTINGS).image
         return browser_gates(image, expected, classes)
+
+    def browser_environment(self, subject: Subject) -> Gates:
+        """Real time under an environment in a browser against float64."""
+        from btfref.validate.stages.browser import environment_gates
+
+        return environment_gates(self.fit(subject)[1], QUICK.browser_ways)
 
     def environment(self, subject: Subject, change: str = "") -> Gates:
         """Real time under an environment against a converged reference."""

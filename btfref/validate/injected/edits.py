@@ -33,6 +33,7 @@ SETTINGS = replace(
     size=24,
     truth_spp=16,
     browser_lights=(),
+    browser_ways=(),
     off_grid_rows=60,
     off_grid_spp=8,
     chi2_samples=50_000,

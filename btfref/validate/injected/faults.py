@@ -169,6 +169,19 @@ FAULTS = (
         edit=("hosts/mesh.vert", "vec4(position, 1.0);", "vec4(position, 1.0) + vec4(0.042, 0.0, 0.0, 0.0);"),
     ),
     Fault(
+        "wrong sign in spherical harmonics in the browser",
+        "image.browser_environment.p999",
+        "browser_environment",
+        edit=("lib/light/harmonics.glsl", "turn.x * q - turn.y * p;", "turn.x * q + turn.y * p;"),
+    ),
+    Fault(
+        "a factor of pi in the irradiance in the browser",
+        "image.browser_environment.max",
+        "browser_environment",
+        "rf_lobes",
+        ("environment/rf_lobes.glsl", "own.a * irradiance;", "3.14159265 * own.a * irradiance;"),
+    ),
+    Fault(
         "edges a pixel off in eight bits", "image.eight_bit_silhouette.nrmse", "eight_bits", change="shifted"
     ),
     Fault(

@@ -32,6 +32,7 @@ def make_checks(cache: Cache, mesostructure: str, method: str, settings: Setting
         {
             "checks": fit_key(mesostructure, method, settings),
             "code": code_of(__name__, method),
+            "browser": settings.browser_ways,
             "samples": [settings.chi2_samples, settings.chi2_intervals],
             "off_grid": truth_key(mesostructure, settings),
         }
@@ -49,11 +50,12 @@ def _measured(cache: Cache, mesostructure: str, key: str, settings: Settings) ->
     from btfref.representations.file.container import read_info
     from btfref.stress.between_samples import between_gates
     from btfref.validate.method_gates import probe_gates, sampling_gates
+    from btfref.validate.stages.browser import environment_gates
     from btfref.validate.witness.gates import testify
 
     start = time.perf_counter()
     file = make_fit(cache, mesostructure, key, settings)
-    gates = [*probe_gates(file), *testify(file).gates()]
+    gates = [*probe_gates(file), *testify(file).gates(), *environment_gates(file, settings.browser_ways)]
     gates += sampling_gates(file, samples=settings.chi2_samples, intervals=settings.chi2_intervals)
     info = read_info(file)
     gates += between_gates(key, info["fit"].get("between_samples", {}))

@@ -64,6 +64,41 @@ def test_numpy_and_moderngl_alone_reproduce_the_answers_of_every_method(folders,
         assert f"{N_PROBES} lookups" in said
 
 
+#: Compiled at every run; the others, which ask nothing else of a compiler, at long ones. The Laplacian pyramid has
+#: arrays of constants, the network matrices.
+ALWAYS = ("laplacian", "neural")
+
+
+def webgpu(script, variables, *arguments):
+    """What a folder's program for WebGPU says, and its exit status."""
+    command = [sys.executable, str(script), *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ | variables)
+    assert done.returncode in (0, 1), done.stderr
+    return done.returncode, done.stdout
+
+
+@pytest.mark.parametrize(
+    "key", [*ALWAYS, *(pytest.param(key, marks=pytest.mark.long) for key in methods() if key not in ALWAYS)]
+)
+def test_webgpu_reproduces_the_answers(folders, need, key):
+    variables = need("wgpu")
+    status, said = webgpu(folders / key / "check_wgpu.py", variables)
+    assert status == 0, said
+    assert f"{N_PROBES} lookups" in said
+
+
+def test_webgpu_is_asked_for_other_texts_and_says_when_they_are_wrong(folders, need, tmp_path):
+    variables, script = need("wgpu"), folders / "rf_poly" / "check_wgpu.py"
+    text = tmp_path / "btf.comp"
+    assert webgpu(script, variables, "--write", text) == (0, "")
+    right = text.read_text()
+    text.write_text(right.replace("= value.x;", "= value.y;"))
+    assert text.read_text() != right
+    status, said = webgpu(script, variables, text)
+    assert status == 1
+    assert "DOES NOT AGREE" in said
+
+
 @pytest.mark.parametrize("key", methods())
 def test_the_page_of_the_folder_reproduces_them_in_chromium(folders, need, key):
     need("chromium")
@@ -219,7 +254,8 @@ def test_the_command(fits, tmp_path, monkeypatch, capsys):
     assert facts["method"] == "rf_poly"
     assert facts["textures"] == 5
     assert {path.name for path in (tmp_path / "port").iterdir()} == {
-        "README.md", "btf.glsl", "check.py", "index.html", "layout.json", "probes.json", "textures", "three",
+        "README.md", "btf.glsl", "check.py", "check_wgpu.py", "index.html", "layout.json", "probes.json", "textures",
+        "three",
     }  # fmt: skip
     for path in (tmp_path / "port").rglob("*"):
         assert path.is_dir() or path.suffix in (".bin", ".ktx2") or "{{" not in path.read_text()

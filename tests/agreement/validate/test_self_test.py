@@ -39,6 +39,7 @@ def test_faults_in_the_browser_need_one(monkeypatch, need):
     assert {fault.meant.rpartition(".")[0] for fault in FAULTS if fault not in possible()} == {
         "image.browser",
         "image.browser_edges",
+        "image.browser_environment",
     }
 
 

@@ -152,6 +152,30 @@ def test_another_browser_makes_other_keys(tmp_path, monkeypatch):
     assert drawn.driver().endswith("Chromium 157.0")
 
 
+def test_ways_of_environments_in_the_browser(fits, monkeypatch):
+    """The quick run draws none of those that are sums over lights alone: they have pictures under lights."""
+    assert tuple(browser.WAYS) == FULL.browser_ways == (*QUICK.browser_ways, "lights")
+    found = {key: browser.environment_ways(fits(key)) for key in ("lpca", "rf_poly", "raw")}
+    assert found == {"lpca": ["sh", "lights"], "rf_poly": ["prefiltered", "lights"], "raw": ["lights"]}
+    assert browser.environment_gates(fits.path("raw"), QUICK.browser_ways) == []
+    monkeypatch.setattr(browser, "chromium", lambda: None)
+    assert browser.environment_gates(fits.path("lpca"), QUICK.browser_ways) == []
+
+
+def test_background_beside_a_surface_is_a_silhouette_in_the_browser():
+    classes = np.full((5, 6), PixelClass.BACKGROUND, np.uint8)
+    classes[0, 0] = classes[0, 1] = PixelClass.INTERIOR
+    found = browser.browser_classes(classes)
+    assert found.dtype == classes.dtype
+    assert (found[0, :2] == PixelClass.INTERIOR).all()
+    assert {tuple(at) for at in np.argwhere(found == PixelClass.SILHOUETTE)} == {
+        (0, 2),
+        (1, 0),
+        (1, 1),
+        (1, 2),
+    }
+
+
 def test_without_a_browser_its_pictures_are_left_out_or_demanded(monkeypatch):
     lights = QUICK.browser_lights[0]
     assert set(QUICK.browser_lights) < set(FULL.browser_lights)
