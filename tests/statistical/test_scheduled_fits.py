@@ -12,6 +12,7 @@ from btfref.cli import main
 from btfref.errors import InputError
 from btfref.provenance import versions
 from btfref.registry import method
+from btfref.representations import between
 from btfref.representations.file.container import save
 from btfref.representations.fit_memory import FIT_BASE, fitted_by
 from btfref.sampling import open_store
@@ -119,7 +120,9 @@ def test_a_worker_that_is_killed_in_a_fit_loses_nothing(tmp_path, distributed, k
         assert set(client.run(os.getpid).values()) != set(before.values())
 
 
-def test_a_cluster_is_reached_by_its_address(tmp_path, path, two):
+def test_a_cluster_is_reached_by_its_address(tmp_path, path, two, monkeypatch):
+    monkeypatch.setattr(between, "LOOKUPS", 64)
+    monkeypatch.setattr(between, "ALBEDOS", 2)
     command = ["fit", "svd", str(path), "--set", "components=2", "-o"]
     alone, shared = tmp_path / "alone.exr", tmp_path / "shared.exr"
     assert main([*command, str(alone)]) == 0

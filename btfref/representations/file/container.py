@@ -8,6 +8,7 @@ back to it.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,8 +20,11 @@ from btfref.images.openexr import opened, write
 from btfref.outputs import new_file
 from btfref.registry import method
 from btfref.representations.file.manifest import (
+    BLOCKS,
+    KIND_BY_ROW,
     KIND_OF_CHECKSUM,
     TYPES,
+    block_of,
     check_parts,
     checksums,
     image_of_entry,
@@ -32,8 +36,10 @@ from btfref.representations.file.manifest import (
 from btfref.representations.file.map_images import (
     channel_names,
     file_shape,
-    image_of,
+    kept_along,
     leading_axes,
+    planes_of,
+    rows_alone,
     rows_of,
 )
 from btfref.representations.file.resident import needed_rows, select
@@ -45,6 +51,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
+    from btfref.representations.file.resident import Taken
     from btfref.representations.protocol import Representation
     from btfref.types import Facts, PathLike
 
@@ -83,45 +90,47 @@ def save(representation: Representation, path: PathLike) -> None:
     for name, axes in rows_by.items():
         if axes:
             manifest["arrays"][name]["rows"] = axes
-    images = {name: _stored_image(name, array, rows_by[name]) for name, array in arrays.items()}
+    images = {name: _stored_planes(name, array, rows_by[name]) for name, array in arrays.items()}
+    alone = {name for name, entry in manifest["arrays"].items() if rows_alone(entry)}
     for name, image in images.items():
-        manifest["arrays"][name][KIND_OF_CHECKSUM] = checksums(image)
+        kind = KIND_BY_ROW if name in alone else KIND_OF_CHECKSUM
+        manifest["arrays"][name][kind] = checksums(image, BLOCKS[kind])
     display = (
         np.zeros(2, np.int32),
         np.array(
-            [max(i.shape[1] for i in images.values()) - 1, max(i.shape[0] for i in images.values()) - 1],
+            [
+                max(i[0].shape[1] for i in images.values()) - 1,
+                max(i[0].shape[0] for i in images.values()) - 1,
+            ],
             np.int32,
         ),
     )
     parts: list[OpenEXR.Part] = []
-    for name, image in images.items():
+    for name, planes in images.items():
         header = {
             "name": name,
             "type": OpenEXR.scanlineimage,
-            "compression": OpenEXR.ZIP_COMPRESSION,
+            "compression": OpenEXR.ZIPS_COMPRESSION if name in alone else OpenEXR.ZIP_COMPRESSION,
             "displayWindow": display,
             "dataWindow": (
                 np.zeros(2, np.int32),
-                np.array([image.shape[1] - 1, image.shape[0] - 1], np.int32),
+                np.array([planes[0].shape[1] - 1, planes[0].shape[0] - 1], np.int32),
             ),
         }
         if not parts:
             header |= text_of(manifest)
-        channels = {
-            channel: np.ascontiguousarray(image[..., i])
-            for i, channel in enumerate(channel_names(image.shape[-1]))
-        }
+        channels = dict(zip(channel_names(len(planes)), planes, strict=True))
         parts.append(OpenEXR.Part(header, channels, name))
     with new_file(path) as draft:
         write(parts, draft)
 
 
-def _stored_image(name: str, array: np.ndarray, leading: Sequence[int]) -> np.ndarray:
-    """A map as the image that stands in the file."""
+def _stored_planes(name: str, array: np.ndarray, leading: Sequence[int]) -> list[np.ndarray]:
+    """Channels of a map as the images that stand in the file."""
     if array.dtype.name not in TYPES:
         raise TypeError(f"map {name} must be one of {TYPES}, got {array.dtype}")
-    image = image_of(array, leading)
-    return (image / 255).astype(np.float16) if image.dtype == np.uint8 else image
+    planes = planes_of(array, leading)
+    return [(p / 255).astype(np.float16) for p in planes] if array.dtype == np.uint8 else planes
 
 
 def load(
@@ -157,13 +166,13 @@ def load(
     chosen = any(indices is not None for indices in choice.values())
     manifest, reader = _opened(path)
     with reader:
-        arrays = _read_some(reader, manifest, choice) if chosen else None
+        arrays, taken = (_read_some(reader, manifest, choice) if chosen else None) or (None, None)
     if arrays is None:
         arrays = _whole_file(path, manifest)
     meta = manifest["meta"]
     kind = method(meta["method"], file=path).representation
     check_values(arrays, manifest, kind, path)
-    arrays, meta = select(arrays, meta, kind, **choice, file=path)
+    arrays, meta = select(arrays, meta, kind, **choice, taken=taken, file=path)
     return kind.from_arrays(arrays, meta)
 
 
@@ -193,8 +202,7 @@ def read_maps(path: PathLike, wanted: Callable[[str], bool]) -> tuple[dict[str, 
             if wanted(name):
                 if not reader.knows(name):
                     raise InputError("a map is missing or compressed in another way", file=path, field=name)
-                pixels = reader.read(name, channel_names(entry["shape"][-1]))
-                arrays[name] = _read_map(path, name, entry, pixels, manifest)
+                arrays[name] = _rows_read(reader, name, entry, manifest, {})
     check_values(arrays, manifest, method(manifest["meta"]["method"], file=path).representation, path)
     return arrays, manifest["meta"]
 
@@ -220,8 +228,11 @@ def bytes_of_choice(path: PathLike, choice: Mapping[str, ArrayLike | None]) -> i
 
 def _read_some(
     reader: RowReader, manifest: Facts, choice: Mapping[str, ArrayLike | None]
-) -> dict[str, np.ndarray] | None:
-    """The maps with the rows that a choice needs, or None where reading the whole file takes no longer."""
+) -> tuple[dict[str, np.ndarray], Taken] | None:
+    """The maps with what a choice needs along axes that are rows, and what :func:`select` is told of these axes.
+
+    None where reading the whole file takes no longer.
+    """
     path = reader.path
     kind = method(manifest["meta"]["method"], file=path).representation
     sizes = {
@@ -229,19 +240,19 @@ def _read_some(
         for name, entry in manifest["arrays"].items()
     }
     wanted = needed_rows(kind, manifest, choice)
-    plans = {name: rows_of(manifest["arrays"][name], axes) for name, axes in wanted.items()}
-    if sum(sizes[name] for name, rows in plans.items() if rows is None) > WORTH * sum(sizes.values()):
-        return None
+    entries = manifest["arrays"]
+    plans = {name: rows_of(entries[name], axes) for name, axes in wanted.items()}
     if not all(reader.knows(name) for name in plans):
         return None
-    if sum(sizes[name] * reader.share(name, plans[name]) for name in plans) > WORTH * sum(sizes.values()):
+    shares = {name: reader.share(name, rows, block_of(entries[name])) for name, rows in plans.items()}
+    if sum(sizes[name] * share for name, share in shares.items()) > WORTH * sum(sizes.values()):
         return None
-    arrays = {}
-    for name, rows in plans.items():
-        entry = manifest["arrays"][name]
-        pixels = reader.read(name, channel_names(entry["shape"][-1]), rows)
-        arrays[name] = _read_map(path, name, entry, pixels, manifest, rows)
-    return arrays
+    arrays = {name: _rows_read(reader, name, entries[name], manifest, axes) for name, axes in wanted.items()}
+    taken = {
+        name: {axis: entries[name]["shape"][axis] for axis in kept_along(entries[name], axes)}
+        for name, axes in wanted.items()
+    }
+    return arrays, taken
 
 
 def read_info(path: PathLike) -> Facts:
@@ -358,22 +369,23 @@ def _header(path: PathLike) -> Facts:
     return manifest
 
 
-def _channels_of(path: PathLike, name: str, entry: Facts, part: Any) -> np.ndarray:
-    """Pixels of a part, shape (rows, columns, channels), its channels in the order of the map's."""
-    result = np.zeros(image_of_entry(entry), stored_type(entry))
-    for i, channel in enumerate(channel_names(result.shape[-1])):
+def _planes_of(path: PathLike, name: str, entry: Facts, part: Any) -> list[np.ndarray]:
+    """Channels of a part in the order of the map's, each (rows, columns)."""
+    rows, columns, n_channels = image_of_entry(entry)
+    planes, kind = [], stored_type(entry)
+    for channel in channel_names(n_channels):
         pixels = part.channels[channel].pixels if channel in part.channels else None
-        if pixels is None or pixels.shape != result.shape[:2] or pixels.dtype != result.dtype:
+        if pixels is None or pixels.shape != (rows, columns) or pixels.dtype != kind:
             got = "nothing" if pixels is None else f"{pixels.dtype} {pixels.shape}"
             raise InputError(
                 "a map is damaged",
                 file=path,
                 field=f"{name}.{channel}",
                 got=got,
-                expected=f"{result.dtype} {result.shape[:2]}",
+                expected=f"{kind} {(rows, columns)}",
             )
-        result[..., i] = pixels
-    return result
+        planes.append(pixels)
+    return planes
 
 
 def _whole_file(path: PathLike, manifest: Facts) -> dict[str, np.ndarray]:
@@ -383,7 +395,7 @@ def _whole_file(path: PathLike, manifest: Facts) -> dict[str, np.ndarray]:
         with opened(path, separate_channels=True) as file:
             parts = {part.header.get("name", ""): part for part in file.parts}
             return {
-                name: _read_map(path, name, entry, _channels_of(path, name, entry, parts[name]), manifest)
+                name: _read_map(path, name, entry, _planes_of(path, name, entry, parts[name]), manifest)
                 for name, entry in manifest["arrays"].items()
             }
     except InputError:
@@ -392,26 +404,52 @@ def _whole_file(path: PathLike, manifest: Facts) -> dict[str, np.ndarray]:
         raise InputError(f"damaged or truncated OpenEXR file: {error}", file=path) from error
 
 
-def _read_map(
-    path: PathLike,
-    name: str,
-    entry: Facts,
-    image: np.ndarray,
-    manifest: Facts,
-    rows: np.ndarray | None = None,
+def _rows_read(
+    reader: RowReader, name: str, entry: Facts, manifest: Facts, axes: Mapping[int, np.ndarray]
 ) -> np.ndarray:
-    """A map from the pixels of its image, of which `rows` were read, checked."""
-    refuse_changed(path, name, entry, image, rows)
+    """A map, of which only the chosen indices along axes that are rows are read, checked."""
+    pixels = reader.read(
+        name,
+        channel_names(entry["shape"][-1]),
+        rows_of(entry, axes),
+        block=block_of(entry),
+        check=partial(refuse_changed, reader.path, name, entry),
+    )
+    shape = file_shape(entry)
+    for axis, kept in kept_along(entry, axes).items():
+        shape[entry["rows"].index(axis)] = len(kept)
+    planes = [pixels[..., i].reshape(shape[:-1]) for i in range(shape[-1])]
+    return _as_map(reader.path, name, entry, planes, manifest)
+
+
+def _read_map(
+    path: PathLike, name: str, entry: Facts, planes: list[np.ndarray], manifest: Facts
+) -> np.ndarray:
+    """A map from the channels of its image, checked."""
+    block = block_of(entry)
+    for number in range(-(-len(planes[0]) // block)):
+        part = slice(number * block, (number + 1) * block)
+        refuse_changed(path, name, entry, number, np.stack([plane[part] for plane in planes], -1))
+    return _as_map(path, name, entry, [p.reshape(file_shape(entry)[:-1]) for p in planes], manifest)
+
+
+def _as_map(path: PathLike, name: str, entry: Facts, planes: list[np.ndarray], manifest: Facts) -> np.ndarray:
+    """A map from its channels with the axes in the order of the file, checked."""
+    leading = entry.get("rows", [])
+    order = [*leading, *(axis for axis in range(planes[0].ndim) if axis not in leading)]
+    shape = [planes[0].shape[order.index(axis)] for axis in range(len(order))]
+    result = np.zeros((*shape, len(planes)), entry["dtype"])
     # What a partial table lacks stands in it as NaN, and gives NaN where it is asked for.
-    partial = manifest["meta"].get("partial", False) and not name.startswith(("view_", "light_"))
-    broken = np.isinf if partial else lambda values: ~np.isfinite(values)
-    if image.dtype.kind == "f" and broken(image).any():
-        raise InputError("a map holds a value that is not finite", file=path, field=name)
-    if entry["dtype"] == "uint8":
-        if ((image < 0) | (image > 1)).any():
-            raise InputError(
-                "an 8-bit map holds a value out of range", file=path, field=name, expected="[0, 1]"
-            )
-        image = np.rint(image.astype(np.float32) * 255).astype(np.uint8)
-    result, leading = image.reshape(file_shape(entry)), entry.get("rows", [])
-    return np.ascontiguousarray(np.moveaxis(result, range(len(leading)), leading)) if leading else result
+    partly = manifest["meta"].get("partial", False) and not name.startswith(("view_", "light_"))
+    for channel, pixels in enumerate(planes):
+        whole = ~np.isinf(pixels) if partly else np.isfinite(pixels)
+        if pixels.dtype.kind == "f" and not whole.all():
+            raise InputError("a map holds a value that is not finite", file=path, field=name)
+        if entry["dtype"] == "uint8":
+            if ((pixels < 0) | (pixels > 1)).any():
+                raise InputError(
+                    "an 8-bit map holds a value out of range", file=path, field=name, expected="[0, 1]"
+                )
+            pixels = np.rint(pixels.astype(np.float32) * 255)
+        result[..., channel].transpose(order)[...] = pixels
+    return result
