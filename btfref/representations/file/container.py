@@ -418,8 +418,7 @@ def _rows_read(
     shape = file_shape(entry)
     for axis, kept in kept_along(entry, axes).items():
         shape[entry["rows"].index(axis)] = len(kept)
-    planes = [pixels[..., i].reshape(shape[:-1]) for i in range(shape[-1])]
-    return _as_map(reader.path, name, entry, planes, manifest)
+    return _as_map(reader.path, name, entry, pixels.reshape(shape), manifest)
 
 
 def _read_map(
@@ -427,29 +426,27 @@ def _read_map(
 ) -> np.ndarray:
     """A map from the channels of its image, checked."""
     block = block_of(entry)
-    for number in range(-(-len(planes[0]) // block)):
-        part = slice(number * block, (number + 1) * block)
-        refuse_changed(path, name, entry, number, np.stack([plane[part] for plane in planes], -1))
-    return _as_map(path, name, entry, [p.reshape(file_shape(entry)[:-1]) for p in planes], manifest)
+    image = np.zeros((*planes[0].shape, len(planes)), planes[0].dtype)
+    for number, first in enumerate(range(0, len(image), block)):
+        lines = image[first : first + block]
+        for i, plane in enumerate(planes):
+            lines[..., i] = plane[first : first + block]
+        refuse_changed(path, name, entry, number, lines)
+    return _as_map(path, name, entry, image.reshape(file_shape(entry)), manifest)
 
 
-def _as_map(path: PathLike, name: str, entry: Facts, planes: list[np.ndarray], manifest: Facts) -> np.ndarray:
-    """A map from its channels with the axes in the order of the file, checked."""
-    leading = entry.get("rows", [])
-    order = [*leading, *(axis for axis in range(planes[0].ndim) if axis not in leading)]
-    shape = [planes[0].shape[order.index(axis)] for axis in range(len(order))]
-    result = np.zeros((*shape, len(planes)), entry["dtype"])
+def _as_map(path: PathLike, name: str, entry: Facts, pixels: np.ndarray, manifest: Facts) -> np.ndarray:
+    """A map from its pixels with the axes in the order of the file, checked."""
     # What a partial table lacks stands in it as NaN, and gives NaN where it is asked for.
     partly = manifest["meta"].get("partial", False) and not name.startswith(("view_", "light_"))
-    for channel, pixels in enumerate(planes):
-        whole = ~np.isinf(pixels) if partly else np.isfinite(pixels)
-        if pixels.dtype.kind == "f" and not whole.all():
-            raise InputError("a map holds a value that is not finite", file=path, field=name)
-        if entry["dtype"] == "uint8":
-            if ((pixels < 0) | (pixels > 1)).any():
-                raise InputError(
-                    "an 8-bit map holds a value out of range", file=path, field=name, expected="[0, 1]"
-                )
-            pixels = np.rint(pixels.astype(np.float32) * 255)
-        result[..., channel].transpose(order)[...] = pixels
-    return result
+    broken = np.isinf if partly else lambda values: ~np.isfinite(values)
+    if pixels.dtype.kind == "f" and broken(pixels).any():
+        raise InputError("a map holds a value that is not finite", file=path, field=name)
+    if entry["dtype"] == "uint8":
+        if ((pixels < 0) | (pixels > 1)).any():
+            raise InputError(
+                "an 8-bit map holds a value out of range", file=path, field=name, expected="[0, 1]"
+            )
+        pixels = np.rint(pixels.astype(np.float32) * 255).astype(np.uint8)
+    leading = entry.get("rows", [])
+    return np.ascontiguousarray(np.moveaxis(pixels, range(len(leading)), leading)) if leading else pixels

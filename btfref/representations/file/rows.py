@@ -167,7 +167,7 @@ class RowReader:
         result = np.zeros((len(wanted), part.columns, len(channels)), part.kind)
         unit = max(block, part.lines)
         units, starts = np.unique(wanted // unit, return_index=True)
-        for number, start, stop in zip(units, starts, [*starts[1:], len(wanted)], strict=True):
+        for number, start, stop in zip(units, starts, [*starts, len(wanted)][1:], strict=True):
             first = int(number) * unit
             chunks = range(first // part.lines, min((first + unit) // part.lines, part.chunks))
             pixels = [self._chunk(name, table, chunk, place) for chunk in chunks]
