@@ -230,13 +230,6 @@ ROWS = [
         ("memory",),
     ),
     Row("memory", "too small a budget", "fit svd good.btf.zarr -o out.exr --memory 100M", ("memory",)),
-    Row(
-        "workers",
-        "a method that needs the whole",
-        "fit gbrdf good.btf.zarr -o out.exr --scheduler dask",
-        ("scheduler",),
-    ),
-    Row("workers", "no address", "fit svd good.btf.zarr -o out.exr --scheduler nowhere", ("scheduler",)),
     Row("memory", "too small a budget", "import image.exr -o new.btf.zarr --memory 100M", ("memory",)),
     Row(
         "memory",
@@ -244,6 +237,13 @@ ROWS = [
         "export good.btf.zarr --format bonn -o new.btf --memory 100M",
         ("memory",),
     ),
+    Row(
+        "workers",
+        "a method that needs the whole",
+        "fit gbrdf good.btf.zarr -o out.exr --scheduler dask",
+        ("scheduler",),
+    ),
+    Row("workers", "no address", "fit svd good.btf.zarr -o out.exr --scheduler nowhere", ("scheduler",)),
     # 7
     Row(
         "locks",
