@@ -16,8 +16,8 @@ from btfref.representations.lookup import direction_arrays, meta_for
 #: What a camera before a plane asks for.
 VIEWS, LIGHTS = np.arange(40, 46), np.array([7, 8])
 
-#: Texels along a side: files of one to eight megabytes.
-TEXELS = {"raw": 24, "lpca": 24, "rf_lobes": 64}
+#: Texels along a side: files of one to four megabytes.
+TEXELS = {"raw": 16, "lpca": 24, "rf_lobes": 64}
 
 
 def edges(grid):
