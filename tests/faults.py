@@ -237,6 +237,13 @@ ROWS = [
         "export good.btf.zarr --format bonn -o new.btf --memory 100M",
         ("memory",),
     ),
+    Row(
+        "workers",
+        "a method that needs the whole",
+        "fit gbrdf good.btf.zarr -o out.exr --scheduler dask",
+        ("scheduler",),
+    ),
+    Row("workers", "no address", "fit svd good.btf.zarr -o out.exr --scheduler nowhere", ("scheduler",)),
     # 7
     Row(
         "locks",

@@ -14,8 +14,11 @@ import numpy as np
 from btfref.numerics.solvers.threads import reproducible
 from btfref.numerics.sphere.quadrature import gauss_hemisphere
 from btfref.representations.lookup import CHUNK
+from btfref.sampling.passes import over_blocks
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import ArrayLike
 
     from btfref.registry import Method
@@ -145,17 +148,27 @@ def _from_data(
     )
     found = np.zeros((*view.shape, light.shape[1], 3))
     largest = -np.inf
-    for index in range(len(btf.views)):
-        values = btf.view(index)
-        largest = max(largest, float(np.max(values)))
-        lookup, place = np.nonzero(view == index)
-        flat = values.reshape(len(values), -1, 3)
-        found[lookup, place] = flat[light[lookup], texel[lookup, None]]
+    for index, (peak, values) in enumerate(
+        over_blocks(btf, _of_view, (view, light, texel), range(len(btf.views)))
+    ):
+        largest = max(largest, peak)
+        found[np.nonzero(view == index)] = values
     result = np.zeros((len(texel), 3))
     for start in range(0, len(texel), CHUNK):
         part = slice(start, start + CHUNK)
         result[part] = np.einsum("nv,nl,nvlc->nc", view_weight[part], light_weight[part], found[part])
     return result, largest
+
+
+def _of_view(
+    btf: BTFBlocks, lookups: tuple[np.ndarray, np.ndarray, np.ndarray], index: int
+) -> Iterator[tuple[float, np.ndarray]]:
+    """The largest value of a view, and those that lookups need of it, (lookups, lights, 3)."""
+    view, light, texel = lookups
+    values = btf.view(index)
+    lookup, _ = np.nonzero(view == index)
+    flat = values.reshape(len(values), -1, 3)
+    yield float(np.max(values)), flat[light[lookup], texel[lookup, None]]
 
 
 def _texels(rng: np.random.Generator, n: int, btf: BTFBlocks) -> tuple[np.ndarray, np.ndarray]:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 
 from btfref.numerics.solvers.threads import in_parallel
 from btfref.representations.lookup import refuse_not_finite
+from btfref.sampling.passes import over_blocks
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Progress
+
+S = TypeVar("S")
+R = TypeVar("R")
 
 #: Bytes of a block in float32, unless a single light has more: some lights of a view. Of every machine and budget the
 #: same, since sums go by blocks.
@@ -111,7 +116,7 @@ class TexelColumns:
         rows, columns = self._btf.texels
         return rows * columns, 3 * len(self._btf.views) * len(self._btf.lights)
 
-    def blocks(self) -> Iterator[tuple[slice, np.ndarray]]:
+    def over(self, work: Callable[[S, slice, np.ndarray], R], shared: S) -> Iterator[tuple[slice, R]]:
         """See :class:`btfref.numerics.solvers.streaming.Columns`.
 
         Raises
@@ -119,14 +124,29 @@ class TexelColumns:
         InputError
             For values that are not finite.
         """
-        n_lights, n_texels = len(self._btf.lights), self.shape[0]
-        for view in range(len(self._btf.views)):
-            values = self._btf.view(view).reshape(n_lights, n_texels, 3)
-            for lights in light_blocks(self._btf):
-                block = planes(values[lights], self._order).reshape(-1, n_texels)
-                if not self._checked:
-                    refuse_not_finite(block, self._btf)
-                first = 3 * (view * n_lights + lights.start)
-                yield slice(first, first + len(block)), block
-            self._tick()
+        task = _Task(work, shared, self._order, not self._checked)
+        yield from over_blocks(self._btf, _view_columns, task, range(len(self._btf.views)), self._tick)
         self._checked = True
+
+
+@dataclass(frozen=True)
+class _Task(Generic[S, R]):
+    """What is made of the columns of each view."""
+
+    work: Callable[[S, slice, np.ndarray], R]
+    shared: S
+    order: np.ndarray | None
+    check: bool
+
+
+def _view_columns(btf: BTFBlocks, task: _Task[S, R], view: int) -> Iterator[tuple[slice, R]]:
+    """The columns of a view, block by block, and what is made of them."""
+    n_lights, n_texels = len(btf.lights), btf.texels[0] * btf.texels[1]
+    values = btf.view(view).reshape(n_lights, n_texels, 3)
+    for lights in light_blocks(btf):
+        block = planes(values[lights], task.order).reshape(-1, n_texels)
+        if task.check:
+            refuse_not_finite(block, btf)
+        first = 3 * (view * n_lights + lights.start)
+        part = slice(first, first + len(block))
+        yield part, task.work(task.shared, part, block)

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from btfref.errors import InputError
 from btfref.representations.protocol import FitMemory, StatesMemory
 from btfref.sampling import SampledBTF, memory
 from btfref.sampling.blocks import StreamedBTF
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from btfref.registry import Method
+    from btfref.sampling.blocks import BTFBlocks
+    from btfref.sampling.scheduling import Scheduler
     from btfref.sampling.store.store import BTFStore
     from btfref.types import Facts
 
@@ -88,6 +94,49 @@ def read_within(
         return SampledBTF.load(store.path, variance=False)
     budget = memory.default_budget() if budget is None else budget
     return StreamedBTF(store, spare=budget - least_budget(method, store, parameters))
+
+
+@contextlib.contextmanager
+def fitted_by(
+    method: Method,
+    store: BTFStore,
+    budget: int | None,
+    parameters: Facts | None,
+    scheduler: Scheduler,
+    workers: int | None,
+) -> Iterator[BTFBlocks]:
+    """A store as a method fits it, by this process or by the workers of a cluster; the bytes are the same.
+
+    Parameters
+    ----------
+    method, store, parameters
+        See :func:`check_budget`.
+    budget : int, optional
+        Bytes of this process and of all workers that it starts together, or of each process where the cluster runs
+        elsewhere; by default half of the machine's memory.
+    scheduler, workers
+        See :func:`btfref.sampling.scheduling.run`; without a scheduler see :func:`read_within`.
+
+    Yields
+    ------
+    BTFBlocks
+
+    Raises
+    ------
+    InputError
+        As for both of these, and for a method that cannot be fitted block by block.
+    """
+    if scheduler is None:
+        yield read_within(method, store, budget, parameters)
+        return
+    if not stated(method).streams:
+        raise InputError("the method needs the whole BTF in one process", field="scheduler", got=method.key)
+    from btfref.sampling.passes import distributed_btf
+
+    check_budget(method, store, budget, parameters)
+    least = least_budget(method, store, parameters)
+    with distributed_btf(store, scheduler, workers, budget, least=least) as btf:
+        yield btf
 
 
 def _number(value: object) -> float:

@@ -115,18 +115,12 @@ def cluster(
             "Dask is not installed, which a scheduler needs", "pip install 'btfref[distributed]'"
         ) from None
     import logging
-    import os
 
     if isinstance(scheduler, distributed.Client):
         yield scheduler, {"memory": memory, "threads": None}
         return
     if scheduler == "dask":
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        count = max(1, cores // 2) if workers is None else int(workers)
-        if count < 1:
-            raise InputError(
-                "workers of a local cluster", field="workers", got=workers, expected="at least 1"
-            )
+        cores, count = processors(), local_workers(workers)
         budget = default_budget() if memory is None else memory
         with (
             distributed.LocalCluster(
@@ -155,6 +149,27 @@ def cluster(
             raise InputError("cannot reach the scheduler", field="scheduler", got=scheduler) from error
         with client:
             yield client, {"memory": memory, "threads": None}
+
+
+def processors() -> int:
+    """Processors that this process may use."""
+    import os
+
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def local_workers(workers: int | None) -> int:
+    """Workers of a local cluster: as many as are asked for, or one per two processors.
+
+    Raises
+    ------
+    InputError
+        Fewer than one.
+    """
+    count = max(1, processors() // 2) if workers is None else int(workers)
+    if count < 1:
+        raise InputError("workers of a local cluster", field="workers", got=workers, expected="at least 1")
+    return count
 
 
 @contextlib.contextmanager
@@ -241,15 +256,35 @@ def hand_out(
         Workers or the scheduler are lost.
     """
     import distributed
-    from distributed.comm.core import CommClosedError
 
     tasks = [client.submit(work, *piece, pure=False, retries=2) for piece in pieces]
     largest = 0
+    with lost_in_one_line(path):
+        try:
+            for future in distributed.as_completed(tasks):
+                count, used = future.result()
+                largest = max(largest, used)
+                done(count)
+        finally:
+            with contextlib.suppress(Exception):  # a cluster that is gone cannot be told
+                client.cancel(tasks)
+    return largest
+
+
+@contextlib.contextmanager
+def lost_in_one_line(path: Path) -> Iterator[None]:
+    """InputError for what Dask says when workers or the scheduler are lost.
+
+    Parameters
+    ----------
+    path : Path
+        What is worked on, for messages.
+    """
+    import distributed
+    from distributed.comm.core import CommClosedError
+
     try:
-        for future in distributed.as_completed(tasks):
-            count, used = future.result()
-            largest = max(largest, used)
-            done(count)
+        yield
     except distributed.scheduler.KilledWorker as error:
         raise InputError(
             "workers were lost again and again; start the same command again to go on",
@@ -263,10 +298,6 @@ def hand_out(
             field="scheduler",
             got=f"{type(error).__name__} {error}".partition("\n")[0],
         ) from None
-    finally:
-        with contextlib.suppress(Exception):  # a cluster that is gone cannot be told
-            client.cancel(tasks)
-    return largest
 
 
 def refuse_other_versions(client: distributed.Client) -> None:

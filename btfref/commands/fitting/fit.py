@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from btfref.commands.shared.options import add_json, add_memory, add_overwrite, add_seed
+from btfref.commands.shared.options import add_json, add_memory, add_overwrite, add_scheduler, add_seed
 from btfref.commands.shared.printing import Progress, bytes_text, emit, number, write_representation
 from btfref.commands.shared.reading import assignments, output_file
 from btfref.errors import InputError
@@ -41,8 +41,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     add_memory(
         parser,
-        "budget of the process, e.g. 2G (default: half of the machine's): a fit that would take more is refused",
+        "budget, e.g. 2G, of all processes together, or of each at an address (default: half of the machine's): a fit "
+        "that would take more is refused",
     )
+    add_scheduler(parser)
     add_seed(parser)
     add_overwrite(parser)
     add_json(parser, "the facts of the file")
@@ -70,22 +72,31 @@ def run(args: Namespace) -> int:
     parameters = row.settings(args.preset, given)
 
     from btfref.representations import between
-    from btfref.representations.fit_memory import read_within
+    from btfref.representations.fit_memory import fitted_by
     from btfref.representations.protocol import FitsPartially
     from btfref.sampling import memory, open_store
+    from btfref.sampling.passes import DistributedBTF
 
+    of_workers = ""
     if args.partial:
+        if args.scheduler is not None:
+            raise InputError("a part is fitted by this process", field="--scheduler", got="beside --partial")
         fitting = row.fitting
         if not isinstance(fitting, FitsPartially):
             raise InputError("the method needs the whole BTF", field="--partial", got=row.key)
         representation = fitting.fit_partial(open_store(args.btf), **parameters)
     else:
-        btf = read_within(row, open_store(args.btf), args.memory, parameters)
-        with Progress() as progress:
+        store = open_store(args.btf)
+        with (
+            fitted_by(row, store, args.memory, parameters, args.scheduler, args.workers) as btf,
+            Progress() as progress,
+        ):
             representation = between.fit(row, btf, seed=args.seed, progress=progress, **parameters)
+            if isinstance(btf, DistributedBTF):
+                of_workers = f", of a worker: {bytes_text(btf.largest)}"
     write_representation(representation, out, json=args.json)
     if not args.json:
-        emit(f"largest memory of the process: {bytes_text(memory.peak())}")
+        emit(f"largest memory of the process: {bytes_text(memory.peak())}{of_workers}")
     _say_between(row.key, representation.meta.get("fit", {}).get("between_samples"), json=args.json)
     return 0
 

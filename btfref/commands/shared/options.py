@@ -36,6 +36,12 @@ def add_image(parser: _ActionsContainer) -> None:
 
 def add_tracing(parser: _ActionsContainer, variant: str) -> None:
     """Where rays are traced: ``--scheduler``, ``--workers``, ``--variant``."""
+    add_scheduler(parser)
+    parser.add_argument("--variant", default=variant, help="of Mitsuba (default %(default)s; cuda_ad_rgb)")
+
+
+def add_scheduler(parser: _ActionsContainer) -> None:
+    """Who works: ``--scheduler``, ``--workers``."""
     parser.add_argument(
         "--scheduler",
         metavar="dask|ADDRESS",
@@ -47,7 +53,6 @@ def add_tracing(parser: _ActionsContainer, variant: str) -> None:
         metavar="N",
         help="of the local cluster (default: one per two processors)",
     )
-    parser.add_argument("--variant", default=variant, help="of Mitsuba (default %(default)s; cuda_ad_rgb)")
 
 
 def add_overwrite(parser: _ActionsContainer) -> None:

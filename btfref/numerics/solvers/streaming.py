@@ -7,9 +7,9 @@ products of a power iteration in one pass: for a block A_b of columns, ``A_bᵀ 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -25,6 +25,10 @@ ROWS = 64
 NOISE = 1e-6
 
 
+S = TypeVar("S")
+R = TypeVar("R")
+
+
 class Columns(Protocol):
     """A matrix that is read by blocks of columns, always the same blocks in the same order."""
 
@@ -32,8 +36,17 @@ class Columns(Protocol):
     def shape(self) -> tuple[int, int]:
         """Rows n and columns d."""
 
-    def blocks(self) -> Iterator[tuple[slice, np.ndarray]]:
-        """Which columns, and their transpose: float32, shape (columns of the block, n), contiguous, for one use."""
+    def over(self, work: Callable[[S, slice, np.ndarray], R], shared: S) -> Iterator[tuple[slice, R]]:
+        """Which columns, and what is made of them, block by block; other processes may make it.
+
+        Parameters
+        ----------
+        work : callable
+            ``(shared, columns, block) -> result``, a function of a module; the block is the columns' transpose,
+            float32, shape (columns of the block, n), contiguous, for one use.
+        shared : object
+            The same for all blocks; nothing may change it.
+        """
 
 
 @dataclass(frozen=True)
@@ -71,11 +84,10 @@ class GramPass:
         self.image = np.zeros((d, basis.shape[1]), np.float32)
         self.sums = np.zeros(basis.shape)
 
-    def add(self, part: slice, block: np.ndarray) -> None:
-        """Take a block of columns, given as its transpose."""
-        image = product(block, self.basis, rows=ROWS)
+    def add(self, part: slice, image: np.ndarray, sums: np.ndarray) -> None:
+        """Take what :func:`gram_products` makes of a block of columns."""
         self.image[part] = image
-        self.sums += product(block.T, image)
+        self.sums += sums
 
     def next_basis(self) -> np.ndarray:
         """Orthonormal columns that span ``A Aᵀ P``, by decreasing energy: their products lose least to rounding."""
@@ -107,6 +119,24 @@ class GramPass:
         return product(u.T[:rank].copy(), q.T).astype(np.float32), coordinates.astype(np.float32)
 
 
+def gram_products(basis: np.ndarray, block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What a block of columns of A, given as its transpose, adds to ``Aᵀ P`` and to ``A Aᵀ P``.
+
+    Parameters
+    ----------
+    basis : ndarray of float32, shape (n, w)
+        P, contiguous.
+    block : ndarray of float32, shape (columns of the block, n)
+
+    Returns
+    -------
+    image : ndarray of float32, shape (columns of the block, w)
+    sums : ndarray of float32, shape (n, w)
+    """
+    image = product(block, basis, rows=ROWS)
+    return image, product(block.T, image)
+
+
 def leading(matrix: Columns, rank: int, rng: np.random.Generator, *, passes: int) -> Leading:
     """The leading principal directions of a matrix, by randomized subspace iteration.
 
@@ -129,13 +159,21 @@ def leading(matrix: Columns, rank: int, rng: np.random.Generator, *, passes: int
     squares = np.zeros(n)
     for index in range(passes):
         step = GramPass(basis, d)
-        for part, block in matrix.blocks():
-            step.add(part, block)
-            if index == 0:
-                squares += np.einsum("ij,ij->j", block, block)
+        for part, (image, sums, own) in matrix.over(_block_products, (step.basis, index == 0)):
+            step.add(part, image, sums)
+            if own is not None:
+                squares += own
         if index < passes - 1:
             basis = step.next_basis()
     return Leading(*step.leading(rank), squares)
+
+
+def _block_products(
+    shared: tuple[np.ndarray, bool], part: slice, block: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """:func:`gram_products`, and where they are asked for the squared lengths of the rows of A within the block."""
+    basis, with_squares = shared
+    return *gram_products(basis, block), np.einsum("ij,ij->j", block, block) if with_squares else None
 
 
 def orthonormal(columns: np.ndarray) -> np.ndarray:
@@ -185,8 +223,7 @@ class _ArrayColumns:
     def shape(self) -> tuple[int, int]:
         return self.matrix.shape[0], self.matrix.shape[1]
 
-    def blocks(self) -> Iterator[tuple[slice, np.ndarray]]:
-        starts: Iterable[int] = range(0, self.matrix.shape[1], self.width)
-        for start in starts:
+    def over(self, work: Callable[[S, slice, np.ndarray], R], shared: S) -> Iterator[tuple[slice, R]]:
+        for start in range(0, self.matrix.shape[1], self.width):
             part = slice(start, min(start + self.width, self.matrix.shape[1]))
-            yield part, np.ascontiguousarray(self.matrix[:, part].T, np.float32)
+            yield part, work(shared, part, np.ascontiguousarray(self.matrix[:, part].T, np.float32))

@@ -34,24 +34,30 @@ def one_blas_thread() -> AbstractContextManager[object]:
 
 
 @contextmanager
-def reproducible() -> Iterator[None]:
+def reproducible(workers: int | None = None) -> Iterator[None]:
     """Context, or decorator, in which results do not depend on the number of threads: the same seed, the same bytes.
 
     BLAS, LAPACK and OpenMP split sums by their threads, and a sum in another order rounds differently: iterations carry
     that on. Here they use one thread each; large products keep the others through :func:`product`, which splits what is
     independent, in the same blocks on every machine. Libraries that are loaded inside of the context are not reached:
     enter it again behind their import.
+
+    Parameters
+    ----------
+    workers : int, optional
+        Threads of :func:`product` and :func:`in_parallel`; by default those that BLAS had.
     """
     import scipy.linalg  # noqa: F401 - it brings a BLAS of its own, which must be there to be limited
-    from threadpoolctl import threadpool_info, threadpool_limits
+    from threadpoolctl import ThreadpoolController
 
-    threads = [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
-    token = _WORKERS.set(max(_WORKERS.get(), *threads, 1))
+    libraries = ThreadpoolController()  # it looks through what is loaded, which takes milliseconds: once
+    threads = [library["num_threads"] for library in libraries.info() if library["user_api"] == "blas"]
+    token = _WORKERS.set(max(_WORKERS.get(), *threads, 1) if workers is None else workers)
     outer = _POOL.get()
     pool = outer or ThreadPoolExecutor(_WORKERS.get())
     of_pool = _POOL.set(pool)
     try:
-        with threadpool_limits(limits=1):
+        with libraries.limit(limits=1):
             yield
     finally:
         _WORKERS.reset(token)

@@ -37,6 +37,11 @@ if TYPE_CHECKING:
     from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Facts, JitArray, Progress
 
+    #: A block's fit, and further maps.
+    BlockFit = tuple[BatchFit, dict[str, np.ndarray]]
+    #: See :func:`fit_texels`.
+    FitBlock = Callable[[BTFBlocks, Facts, np.ndarray], BlockFit]
+
 
 #: See :mod:`btfref.representations.fit_memory`.
 FIT_MEMORY = FitMemory(blocks=220 << 20, scales=("lobes",), rows=4, texels=light_functions.BLOCK, texel=400)
@@ -306,20 +311,20 @@ def fit(
         Without LLVM or CUDA.
     """
     n_lobes = positive_integer("lobes", lobes)
-
-    def fit_block(luminance: np.ndarray) -> tuple[BatchFit, dict[str, np.ndarray]]:
-        result = fit_lafortune(luminance, btf.views, btf.lights, n_lobes)
-        return result, {}
-
     parameters = {"lobes": n_lobes, "storage": storage, "seed": seed}
-    return fit_texels(Representation, "lafortune", btf, fit_block, parameters, progress, storage, filter_type)
+    return fit_texels(Representation, "lafortune", btf, _lobes, parameters, progress, storage, filter_type)
+
+
+def _lobes(btf: BTFBlocks, parameters: Facts, luminance: np.ndarray) -> BlockFit:
+    """A block's lobes."""
+    return fit_lafortune(luminance, btf.views, btf.lights, parameters["lobes"]), {}
 
 
 def fit_texels(
     made: type[light_functions.M],
     method: str,
     btf: BTFBlocks,
-    fit_block: Callable[[np.ndarray], tuple[BatchFit, dict[str, np.ndarray]]],
+    fit_block: FitBlock,
     parameters: Facts,
     progress: Progress | None,
     storage: str,
@@ -330,12 +335,15 @@ def fit_texels(
     Parameters
     ----------
     fit_block : callable
-        ``luminance (n_views, n_lights, n) -> (BatchFit, {name: (n, width) further maps})``.
+        ``(btf, parameters, luminance (n_views, n_lights, n)) -> (BatchFit, {name: (n, width) further maps})``, a
+        function of a module.
     """
     rows, columns = btf.texels
     blocks, fits = [], []
-    for _, luminance, chroma in light_functions.luminance_blocks(btf, progress, "lobes"):
-        result, further = fit_block(luminance)
+    task = fit_block, parameters
+    for _, (result, further, chroma) in light_functions.over_luminance(
+        btf, _fit_block, task, progress, "lobes"
+    ):
         lobes, peaks, diffuse = lobe_maps(result.parameters)
         colour = np.concatenate([chroma, diffuse[:, None]], 1)
         blocks.append({"lobes": lobes, "peaks": peaks, "colour": colour} | further)
@@ -357,3 +365,15 @@ def fit_texels(
         facts=everything.summary | {"not_converged_at": failed[:1000].tolist()},
         by_view=False,
     )
+
+
+def _fit_block(
+    btf: BTFBlocks,
+    task: tuple[FitBlock, Facts],
+    part: slice,
+    luminance: np.ndarray,
+    chroma: np.ndarray,
+) -> tuple[BatchFit, dict[str, np.ndarray], np.ndarray]:
+    """A block's fit, further maps and chroma."""
+    fit_block, parameters = task
+    return *fit_block(btf, parameters, luminance), chroma

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from btfref.numerics.solvers.levenberg import BatchFit
     from btfref.representations.analytic.light_functions import HeldStencils
     from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Facts, Progress
@@ -134,21 +133,23 @@ def fit(
         Without LLVM or CUDA.
     """
     n_lobes, rounds = positive_integer("lobes", lobes), positive_integer("rounds", rounds)
-
-    def fit_block(luminance: np.ndarray) -> tuple[BatchFit, dict[str, np.ndarray]]:
-        result = lafortune.fit_lafortune(luminance, btf.views, btf.lights, n_lobes)
-        factor = view_factor(luminance, result.parameters, btf, bounded=bounded)
-        for _ in range(rounds):
-            result = lafortune.fit_lafortune(
-                luminance, btf.views, btf.lights, n_lobes, start=result.parameters, factor=factor
-            )
-            factor = view_factor(luminance, result.parameters, btf, bounded=bounded)
-        return result, {"factor": factor.T}
-
     parameters = {"lobes": n_lobes, "rounds": rounds, "bounded": bounded, "storage": storage, "seed": seed}
     return lafortune.fit_texels(
-        Representation, "lafortune_lut", btf, fit_block, parameters, progress, storage, filter_type
+        Representation, "lafortune_lut", btf, _lobes_and_factor, parameters, progress, storage, filter_type
     )
+
+
+def _lobes_and_factor(btf: BTFBlocks, parameters: Facts, luminance: np.ndarray) -> lafortune.BlockFit:
+    """A block's lobes and factor."""
+    n_lobes, bounded = parameters["lobes"], parameters["bounded"]
+    result = lafortune.fit_lafortune(luminance, btf.views, btf.lights, n_lobes)
+    factor = view_factor(luminance, result.parameters, btf, bounded=bounded)
+    for _ in range(parameters["rounds"]):
+        result = lafortune.fit_lafortune(
+            luminance, btf.views, btf.lights, n_lobes, start=result.parameters, factor=factor
+        )
+        factor = view_factor(luminance, result.parameters, btf, bounded=bounded)
+    return result, {"factor": factor.T}
 
 
 def view_factor(

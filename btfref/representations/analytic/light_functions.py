@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
@@ -27,9 +28,10 @@ from btfref.representations.lookup import (
     given,
     refuse_not_finite,
 )
+from btfref.sampling.passes import over_blocks
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
     from numpy.typing import ArrayLike
 
@@ -39,6 +41,11 @@ if TYPE_CHECKING:
 
 
 M = TypeVar("M", bound="AnalyticMaps")
+S = TypeVar("S")
+R = TypeVar("R")
+
+#: What is made of a block: see :func:`over_luminance`.
+LuminanceWork = Callable[["BTFBlocks", S, slice, np.ndarray, np.ndarray], R]
 
 #: Texels fitted at a time: bounds the memory of luminance tables and of normal equations.
 BLOCK = 4096
@@ -132,16 +139,12 @@ def edge_constants(btf: BTFBlocks) -> dict[str, float]:
     return {name: float(np.float32(edge)) if edge > 1e-6 else 0.0 for name, edge in edges.items()}
 
 
-def luminance_blocks(
-    btf: BTFBlocks, progress: Progress | None = None, label: str = "fit"
-) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+def luminance_blocks(btf: BTFBlocks) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
     """Luminance and chroma of the texels, some at a time.
 
     Parameters
     ----------
     btf : BTFBlocks
-    progress : callable, optional
-        ``progress(done, total, label)`` after each block.
 
     Yields
     ------
@@ -156,21 +159,64 @@ def luminance_blocks(
     InputError
         For values that are not finite.
     """
-    n_views, n_lights, (rows, columns) = len(btf.views), len(btf.lights), btf.texels
-    step = max(1, BLOCK // columns)
-    for first in range(0, rows, step):
-        block = np.asarray(btf.rows(first, min(first + step, rows)), np.float32).reshape(
-            n_views, n_lights, -1, 3
-        )
-        refuse_not_finite(block, btf)
-        luminance = block @ conventions.LUMINANCE.astype(np.float32)
-        energy = np.einsum("vln,vln->n", luminance, luminance, dtype=float)
-        chroma = np.einsum("vlnc,vln->nc", block, luminance, dtype=float)
-        chroma = np.where(energy[:, None] > 0, chroma / np.where(energy > 0, energy, 1)[:, None], 1.0)
-        part = slice(first * columns, min(first + step, rows) * columns)
-        yield part, luminance, chroma
+    for rows in _row_blocks(btf):
+        yield _luminance_block(btf, rows)
+
+
+def over_luminance(
+    btf: BTFBlocks, work: LuminanceWork[S, R], shared: S, progress: Progress | None = None, label: str = "fit"
+) -> Iterator[tuple[slice, R]]:
+    """What is made of :func:`luminance_blocks`, in their order; workers of a cluster may make it.
+
+    Parameters
+    ----------
+    btf : BTFBlocks
+    work : callable
+        ``(btf, shared, part, luminance, chroma) -> result``, a function of a module.
+    shared : object
+        The same for all blocks; nothing may change it.
+    progress : callable, optional
+        ``progress(done, total, label)`` after each block.
+
+    Yields
+    ------
+    part : slice
+        Of the flat texel index.
+    result : object
+    """
+    n_texels = btf.texels[0] * btf.texels[1]
+    for part, result in over_blocks(btf, _of_luminance, (work, shared), _row_blocks(btf)):
+        yield part, result
         if progress:
-            progress(part.stop, rows * columns, label)
+            progress(part.stop, n_texels, label)
+
+
+def _row_blocks(btf: BTFBlocks) -> list[tuple[int, int]]:
+    """First and last rows of the blocks."""
+    rows, columns = btf.texels
+    step = max(1, BLOCK // columns)
+    return [(first, min(first + step, rows)) for first in range(0, rows, step)]
+
+
+def _luminance_block(btf: BTFBlocks, rows: tuple[int, int]) -> tuple[slice, np.ndarray, np.ndarray]:
+    """See :func:`luminance_blocks`."""
+    columns = btf.texels[1]
+    block = np.asarray(btf.rows(*rows), np.float32).reshape(len(btf.views), len(btf.lights), -1, 3)
+    refuse_not_finite(block, btf)
+    luminance = block @ conventions.LUMINANCE.astype(np.float32)
+    energy = np.einsum("vln,vln->n", luminance, luminance, dtype=float)
+    chroma = np.einsum("vlnc,vln->nc", block, luminance, dtype=float)
+    chroma = np.where(energy[:, None] > 0, chroma / np.where(energy > 0, energy, 1)[:, None], 1.0)
+    return slice(rows[0] * columns, rows[1] * columns), luminance, chroma
+
+
+def _of_luminance(
+    btf: BTFBlocks, task: tuple[LuminanceWork[S, R], S], rows: tuple[int, int]
+) -> Iterator[tuple[slice, R]]:
+    """What is made of a block."""
+    work, shared = task
+    part, luminance, chroma = _luminance_block(btf, rows)
+    yield part, work(btf, shared, part, luminance, chroma)
 
 
 def mean_absolute_error(representation: AnalyticMaps, btf: BTFBlocks) -> np.ndarray:
@@ -181,13 +227,25 @@ def mean_absolute_error(representation: AnalyticMaps, btf: BTFBlocks) -> np.ndar
     ndarray of float64, shape (n_texels,)
         In units of the radiance factor π B, where a white diffuser under perpendicular light has 1.
     """
-    n_views = len(btf.views)
     result = np.zeros(int(np.prod(btf.texels)))
-    for part, luminance, _ in luminance_blocks(btf):
-        texels = np.arange(part.start, part.stop)
-        for view in range(n_views):
-            model = representation.luminance_tables(texels, np.array([view]))[:, 0]
-            result[part] += np.pi * np.abs(luminance[view].T - model).mean(1, dtype=float) / n_views
+    for part, error in over_luminance(btf, _absolute_error, representation):
+        result[part] = error
+    return result
+
+
+def _absolute_error(
+    btf: BTFBlocks,
+    representation: AnalyticMaps,
+    part: slice,
+    luminance: np.ndarray,
+    chroma: np.ndarray,
+) -> np.ndarray:
+    """:func:`mean_absolute_error` of a block."""
+    texels, n_views = np.arange(part.start, part.stop), len(btf.views)
+    result = np.zeros(len(texels))
+    for view in range(n_views):
+        model = representation.luminance_tables(texels, np.array([view]))[:, 0]
+        result += np.pi * np.abs(luminance[view].T - model).mean(1, dtype=float) / n_views
     return result
 
 

@@ -276,18 +276,11 @@ def fit(
         "colour": np.zeros((rows * columns, 4), np.float32),
     }
     summaries, failed = [], []
-    for part, luminance, chroma in light_functions.luminance_blocks(btf, progress, "lobes"):
-        diffuse = diffuse_albedo(luminance, btf.lights.vectors, diffuse_quantile)
-        data = luminance - (diffuse * btf.lights.vectors[:, 2, None]).astype(np.float32)
-        n = data.shape[2]
-        found = fit_lobes(data.swapaxes(1, 2).reshape(n_views * n, -1), btf.lights, n_lobes)
-        numbers = found.parameters.reshape(n_views, n, 4 * n_lobes)
-        numbers[..., 2::4] = np.exp(numbers[..., 2::4])
-        maps["lobes"][part] = numbers.swapaxes(0, 1)
-        maps["colour"][part] = np.concatenate([chroma, diffuse[:, None]], 1)
-        summaries.append(found.summary)
-        view, texel = np.divmod(np.flatnonzero(~found.converged), n)
-        failed += np.stack([texel + part.start, view], 1).tolist()
+    settings = n_lobes, float(diffuse_quantile)
+    for part, block in light_functions.over_luminance(btf, _lobes_of_block, settings, progress, "lobes"):
+        maps["lobes"][part], maps["colour"][part], summary, without = block
+        summaries.append(summary)
+        failed += without
     shapes = {"lobes": (rows, columns, n_views, -1), "colour": (rows, columns, 4)}
     maps = {name: stored(name, array.reshape(shapes[name]), storage) for name, array in maps.items()}
     return light_functions.finished(
@@ -301,6 +294,22 @@ def fit(
         facts=merged(summaries) | {"not_converged_at": failed[:1000]},
         by_view=True,
     )
+
+
+def _lobes_of_block(
+    btf: BTFBlocks, settings: tuple[int, float], part: slice, luminance: np.ndarray, chroma: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, Facts, list[list[int]]]:
+    """Lobes (n, view, 4 n_lobes) and colours of a block's texels, a summary, and pairs that did not converge."""
+    n_lobes, quantile = settings
+    diffuse = diffuse_albedo(luminance, btf.lights.vectors, quantile)
+    data = luminance - (diffuse * btf.lights.vectors[:, 2, None]).astype(np.float32)
+    n_views, _, n = data.shape
+    found = fit_lobes(data.swapaxes(1, 2).reshape(n_views * n, -1), btf.lights, n_lobes)
+    numbers = found.parameters.reshape(n_views, n, 4 * n_lobes)
+    numbers[..., 2::4] = np.exp(numbers[..., 2::4])
+    view, texel = np.divmod(np.flatnonzero(~found.converged), n)
+    without = np.stack([texel + part.start, view], 1).tolist()
+    return numbers.swapaxes(0, 1), np.concatenate([chroma, diffuse[:, None]], 1), found.summary, without
 
 
 def merged(summaries: list[Facts]) -> Facts:

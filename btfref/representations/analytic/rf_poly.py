@@ -160,9 +160,11 @@ def fit(
     n_views, (rows, columns) = len(btf.views), btf.texels
     polynomial = np.zeros((rows * columns, n_views, 6), np.float32)
     chroma = np.zeros((rows * columns, 3))
-    for part, luminance, colour in light_functions.luminance_blocks(btf, progress, "polynomials"):
-        polynomial[part] = np.einsum("kl,vln->nvk", operator.astype(np.float32), luminance, optimize=True)
-        chroma[part] = colour
+    blocks = light_functions.over_luminance(
+        btf, _polynomials, operator.astype(np.float32), progress, "polynomials"
+    )
+    for part, (found, colour) in blocks:
+        polynomial[part], chroma[part] = found, colour
     maps = {
         "polynomial": stored("polynomial", polynomial.reshape(rows, columns, n_views, 6), storage),
         "chroma": stored("chroma", chroma.reshape(rows, columns, 3), storage),
@@ -177,3 +179,10 @@ def fit(
         facts=conditioning,
         by_view=True,
     )
+
+
+def _polynomials(
+    btf: BTFBlocks, operator: np.ndarray, part: slice, luminance: np.ndarray, chroma: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Polynomials of a block's texels, (n, view, 6), and their chroma."""
+    return np.einsum("kl,vln->nvk", operator, luminance, optimize=True), chroma

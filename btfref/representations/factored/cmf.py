@@ -13,7 +13,7 @@ hundred times the data's maximum there.
 
 from __future__ import annotations
 
-import itertools
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,7 +47,7 @@ from btfref.representations.protocol import FitMemory
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-    from btfref.representations.factored.fit import Step
+    from btfref.representations.factored.fit import PartFactors, Step
     from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Progress
 
@@ -362,25 +362,9 @@ def factorize(
     n_parts = len(texel_parts(int(np.prod(btf.texels))))
     # A few parts from all over the texture.
     probed = set(np.linspace(0, n_parts - 1, min(N_PROBED_PARTS, n_parts)).round().astype(int).tolist())
-    probes, done = [], itertools.count()
-
-    def one_part(data: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        factors = chain(data, resampling, terms, floor)
-        models = {"factors": resampling.measured.product(factors)}
-        if next(done) in probed:
-            probes.append(resampling.errors(data, factors))
-        samples = [Samples(data, resampling.through_maps)]
-        if between > 0:
-            interpolated = resampling.to_between @ data.reshape(-1, data.shape[-1])
-            samples.append(Samples(interpolated, resampling.between, between * data.size / interpolated.size))
-        factors = refine(samples, factors, sweeps, exponent)
-        models["maps"] = resampling.through_maps.product(factors)
-        maps = {
-            name: np.stack([resampling.to_maps[name] @ term for term in factors[name]]) for name in factors
-        }
-        return maps, models
-
-    maps, facts = factorized(btf, counts, map_size, step, one_part)
+    one_part = _Part(resampling, terms, floor, between, sweeps, exponent, frozenset(probed))
+    maps, facts, measured = factorized(btf, counts, map_size, step, one_part)
+    probes = [found for found in measured if found is not None]
     facts["resampling"] = {name: float(np.mean([p[name] for p in probes])) for name in probes[0]}
     parameters = {
         "difference": difference,
@@ -393,3 +377,34 @@ def factorize(
         "map_size": map_size,
     }
     return Factors("cmf", maps, exponent, parameters, facts)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """See :class:`btfref.representations.factored.fit.FactorizesPart`, and :func:`factorize` for the settings."""
+
+    resampling: Resampling
+    terms: int
+    floor: float
+    between: float
+    sweeps: int
+    exponent: float
+    probed: frozenset[int]
+
+    def __call__(self, index: int, data: np.ndarray) -> PartFactors:
+        """Maps, approximations, and of some parts the errors of the changes of parameterization."""
+        resampling = self.resampling
+        factors = chain(data, resampling, self.terms, self.floor)
+        models = {"factors": resampling.measured.product(factors)}
+        probe = resampling.errors(data, factors) if index in self.probed else None
+        samples = [Samples(data, resampling.through_maps)]
+        if self.between > 0:
+            interpolated = resampling.to_between @ data.reshape(-1, data.shape[-1])
+            share = self.between * data.size / interpolated.size
+            samples.append(Samples(interpolated, resampling.between, share))
+        factors = refine(samples, factors, self.sweeps, self.exponent)
+        models["maps"] = resampling.through_maps.product(factors)
+        maps = {
+            name: np.stack([resampling.to_maps[name] @ term for term in factors[name]]) for name in factors
+        }
+        return maps, models, probe

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -12,9 +12,10 @@ from btfref.errors import InputError
 from btfref.representations.factored.definition import texel_parts
 from btfref.representations.lookup import positive_integer, refuse_not_finite
 from btfref.sampling.blocks import texel_values
+from btfref.sampling.passes import over_blocks
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Facts, Progress
@@ -23,8 +24,32 @@ if TYPE_CHECKING:
 #: Called with what begins.
 Step = Callable[[str], object]
 
-#: Tables of some texels → their maps, and approximations of these tables by name; see :func:`factorized`.
-FactorizePart = Callable[[np.ndarray], tuple[dict[str, np.ndarray], dict[str, np.ndarray]]]
+#: What is made of some texels; see :class:`FactorizesPart`.
+PartFactors = tuple[dict[str, np.ndarray], dict[str, np.ndarray], Any]
+
+
+class FactorizesPart(Protocol):
+    """Factorizes the tables of some texels: an object of a module's class, so that workers can be given it."""
+
+    def __call__(self, index: int, data: np.ndarray) -> PartFactors:
+        """Maps, approximations and facts of a part.
+
+        Parameters
+        ----------
+        index : int
+            Of the part.
+        data : ndarray
+            Of :func:`unit_tables`.
+
+        Returns
+        -------
+        maps : dict of str to ndarray, shape (term, n², m)
+            Of tables of mean 1.
+        models : dict of str to ndarray
+            Approximations of these tables by name.
+        facts : object
+            What else is measured.
+        """
 
 
 @dataclass(frozen=True)
@@ -82,8 +107,8 @@ def checked_map_size(map_size: object) -> int:
 
 
 def factorized(
-    btf: BTFBlocks, counts: Mapping[str, int], map_size: int, step: Step, factorize: FactorizePart
-) -> tuple[dict[str, np.ndarray], Facts]:
+    btf: BTFBlocks, counts: Mapping[str, int], map_size: int, step: Step, factorize: FactorizesPart
+) -> tuple[dict[str, np.ndarray], Facts, list[Any]]:
     """Factorize all texels, part by part.
 
     Parameters
@@ -94,15 +119,16 @@ def factorized(
     map_size : int
     step : callable
         ``step(label)``, called for each of :func:`~btfref.representations.factored.definition.texel_parts`.
-    factorize : callable
-        ``data -> (maps, models)``: of :func:`unit_tables`, the maps (term, n², m) of tables of mean 1, and
-        approximations of these tables by name. P gets the mean here.
+    factorize : FactorizesPart
+        P gets the mean here.
 
     Returns
     -------
     maps : dict of str to ndarray of float32, shape (texel, term, n, n, 3)
     errors : dict of str to float
         Relative squared errors of the approximations.
+    facts : list
+        What ``factorize`` measured of each part.
     """
     n_texels = int(np.prod(btf.texels))
     maps = {
@@ -110,19 +136,34 @@ def factorized(
     }
     energy = 0.0
     squared: dict[str, float] = {}
-    for texels in texel_parts(n_texels):
+    facts = []
+    parts = texel_parts(n_texels)
+    made = over_blocks(btf, _factorized_part, factorize, list(enumerate(parts)))
+    for texels in parts:
         step("factorization")
-        data, mean = unit_tables(btf, texels)
-        found, models = factorize(data)
-        energy += float(((data * mean).astype(float) ** 2).sum())
-        for name, model in models.items():
-            error = float((((model - data) * mean).astype(float) ** 2).sum())
+        found, own_energy, errors, measured = next(made)
+        energy += own_energy
+        for name, error in errors.items():
             squared[name] = squared.get(name, 0.0) + error
-        found["p"] = found["p"] * mean
         for name, values in found.items():
             values = values.reshape(counts[name], map_size, map_size, len(texels), 3)
             maps[name][texels] = np.moveaxis(values, 3, 0)
-    return maps, {name: value / energy if energy > 0 else 0.0 for name, value in squared.items()}
+        facts.append(measured)
+    return maps, {name: value / energy if energy > 0 else 0.0 for name, value in squared.items()}, facts
+
+
+def _factorized_part(
+    btf: BTFBlocks, factorize: FactorizesPart, part: tuple[int, np.ndarray]
+) -> Iterator[tuple[dict[str, np.ndarray], float, dict[str, float], Any]]:
+    """Maps of a part, its energy, squared errors of the approximations, and what else was measured."""
+    index, texels = part
+    data, mean = unit_tables(btf, texels)
+    found, models, facts = factorize(index, data)
+    errors = {
+        name: float((((model - data) * mean).astype(float) ** 2).sum()) for name, model in models.items()
+    }
+    found["p"] = found["p"] * mean
+    yield found, float(((data * mean).astype(float) ** 2).sum()), errors, facts
 
 
 def unit_tables(btf: BTFBlocks, texels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

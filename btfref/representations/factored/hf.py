@@ -9,6 +9,7 @@ channels.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,8 +31,9 @@ from btfref.representations.protocol import FitMemory
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
+    from btfref.numerics.solvers.factoring import FactorOperators
     from btfref.numerics.sphere.directions import DirectionSet
-    from btfref.representations.factored.fit import Step
+    from btfref.representations.factored.fit import PartFactors, Step
     from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Facts, Progress
 
@@ -271,19 +273,8 @@ def factorize(
     reached = {
         name: np.asarray(getattr(operators, name).max(0).todense()).ravel() > REACHED for name in "pqr"
     }
-    log_errors = []
-
-    def one_part(data: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        log_data = logarithms(data, floor)
-        solution = system.solve(factor, log_data)
-        log_errors.append(((system.rows @ solution - log_data) ** 2).mean(0))
-        found = system.maps(solution)
-        if bounded:
-            found = {name: np.minimum(m, m[reached[name]].max(0)) for name, m in found.items()}
-        maps = {name: m[None] for name, m in found.items()}
-        return maps, {"maps": operators.product(maps)}
-
-    maps, squared = factorized(btf, dict.fromkeys("pqr", 1), map_size, step, one_part)
+    one_part = _Part(system, factor, operators, floor, reached if bounded else None)
+    maps, squared, log_errors = factorized(btf, dict.fromkeys("pqr", 1), map_size, step, one_part)
     facts |= squared | {
         "smoothness": chosen,
         "log_rms": float(np.sqrt(np.concatenate(log_errors).mean())),
@@ -295,3 +286,37 @@ def factorize(
         "map_size": map_size,
     }
     return Factors("hf", maps, EXPONENT, parameters, facts)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """See :class:`btfref.representations.factored.fit.FactorizesPart`.
+
+    Attributes
+    ----------
+    system : LogSystem
+    factor : tuple
+        Of :meth:`LogSystem.factorize`.
+    operators : FactorOperators
+    floor : float
+        See :func:`factorize`.
+    reached : dict of str to ndarray of bool, optional
+        Texels of the maps whose largest value bounds the others.
+    """
+
+    system: LogSystem
+    factor: tuple[np.ndarray, bool]
+    operators: FactorOperators
+    floor: float
+    reached: dict[str, np.ndarray] | None
+
+    def __call__(self, index: int, data: np.ndarray) -> PartFactors:
+        """Maps, approximations, and mean squared errors of the logarithms, (m,)."""
+        log_data = logarithms(data, self.floor)
+        solution = self.system.solve(self.factor, log_data)
+        errors = ((self.system.rows @ solution - log_data) ** 2).mean(0)
+        found = self.system.maps(solution)
+        if self.reached is not None:
+            found = {name: np.minimum(m, m[self.reached[name]].max(0)) for name, m in found.items()}
+        maps = {name: m[None] for name, m in found.items()}
+        return maps, {"maps": self.operators.product(maps)}, errors

@@ -8,26 +8,26 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics.solvers.factoring import TINY, map_operators, sample_weights
+from btfref.numerics.solvers.factoring import TINY
 from btfref.numerics.solvers.lowrank import range_basis
 from btfref.numerics.solvers.threads import product, reproducible
 from btfref.representations.factored.definition import (
     FACTORS,
     Representation,
-    batch_last,
     decoded,
-    index_slots,
     texel_parts,
 )
-from btfref.representations.factored.fit import Steps, unit_tables
+from btfref.representations.factored.fit import Steps
+from btfref.representations.factored.moments import moments_of
 from btfref.representations.lookup import base_meta, direction_arrays, stored
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from btfref.representations.factored.fit import Factors, Step
+    from btfref.representations.factored.moments import Moments
     from btfref.sampling.blocks import BTFBlocks
-    from btfref.types import Facts, Progress
+    from btfref.types import Progress
 
 
 #: Storage of the maps: floats, halves, or 8-bit codes of [0, 1].
@@ -46,10 +46,6 @@ MINI_BATCH_ABOVE = 1 << 16
 
 #: Multiplicative steps of the scales of several terms; with one term the first step is exact.
 SCALE_STEPS = 50
-
-
-#: Inner products of the data with itself (texel, 3), with the terms (texel, 3, term), of terms (texel, 3, term, term).
-Moments = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -305,7 +301,7 @@ def store(
     }
     meta["index_bytes"] = {"index": 1 if index.max() < 256 else 2}
     step("scales")
-    moments, weighted = _moments(btf, arrays, meta["constants"], scale, half_scale, factors.exponent)
+    moments, weighted = moments_of(btf, arrays, meta["constants"], scale, half_scale, factors.exponent)
     error = _error(moments, scale)
     if storing.rescale:
         scale = _fitted_scale(weighted, scale)
@@ -317,64 +313,6 @@ def store(
     kept = decoded(scale_map, storing.scale_power).reshape(scale.shape) * limit
     meta["fit"] = factors.facts | {"error": _error(moments, kept), "error_before_rescaling": error}
     return Representation(arrays | direction_arrays(btf.views, btf.lights), meta)
-
-
-def _moments(
-    btf: BTFBlocks,
-    arrays: dict[str, np.ndarray],
-    constants: Facts,
-    scale: np.ndarray,
-    half_scale: np.ndarray,
-    exponent: float,
-) -> tuple[Moments, Moments]:
-    """Inner products of data and unscaled terms, per texel and channel: plain ones, and weighted by the scaled terms.
-
-    Returns
-    -------
-    moments, weighted : Moments
-    """
-    operators = map_operators(
-        btf.views.vectors, btf.lights.vectors, arrays["factor_p"].shape[1], "factor_d" in arrays
-    )
-    slots, power = index_slots(constants), constants["map_power"]
-    index = arrays["index"].reshape(-1, arrays["index"].shape[-1])
-    if "half_scale" in arrays:
-        half_scale = decoded(arrays["half_scale"], power).reshape(half_scale.shape)
-    parts: tuple[list[Moments], list[Moments]] = [], []
-    for texels in texel_parts(len(index)):
-        data, mean = unit_tables(btf, texels)
-        factors = {}
-        for name in FACTORS:
-            if f"factor_{name}" in arrays:
-                m = decoded(arrays[f"factor_{name}"][index[texels, slots[name]]], power, np.float32)
-                if name == "q":
-                    m = m * half_scale[texels][:, :, None, None].astype(np.float32)
-                factors[name] = batch_last(m)
-        half = operators.half(factors)
-        p, r = operators.read("p", factors["p"]), operators.read("r", factors["r"])
-        terms = np.stack([half * a[:, None] * b for a, b in zip(r, p, strict=True)])
-        amount = np.moveaxis(scale[texels], 0, 1).reshape(len(terms), -1) / np.where(mean > 0, mean, 1)
-        model = np.einsum("kvlm,km->vlm", terms, amount.astype(np.float32))
-        for part, weight in zip(parts, (1, sample_weights(model, exponent)), strict=True):
-            heavy = weight * terms
-            size = mean.astype(float)
-            part.append(
-                (
-                    np.einsum("vlm,vlm->m", weight * data, data) * size**2,
-                    np.einsum("vlm,kvlm->mk", data, heavy) * size[:, None],
-                    np.einsum("jvlm,kvlm->mjk", terms, heavy).astype(float),
-                )
-            )
-    plain, weighted = (_joined(part, len(index)) for part in parts)
-    return plain, weighted
-
-
-def _joined(parts: list[Moments], n_texels: int) -> Moments:
-    """Moments of all texels from those of their parts."""
-    energy, product, gram = (
-        np.concatenate(m).reshape(n_texels, 3, *m[0].shape[1:]) for m in zip(*parts, strict=True)
-    )
-    return energy, product, gram
 
 
 def _fitted_scale(moments: Moments, scale: np.ndarray) -> np.ndarray:

@@ -9,33 +9,35 @@ back to it.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.conventions import SCHEMA_VERSION
 from btfref.errors import InputError
-from btfref.images.openexr import opened, write
+from btfref.images.openexr import write
 from btfref.outputs import new_file
 from btfref.registry import method
 from btfref.representations.file.manifest import (
+    BLOCKS,
+    KIND_BY_ROW,
     KIND_OF_CHECKSUM,
     TYPES,
+    block_of,
     check_parts,
     checksums,
-    image_of_entry,
     parsed,
-    refuse_changed,
-    stored_type,
     text_of,
 )
 from btfref.representations.file.map_images import (
     channel_names,
-    file_shape,
-    image_of,
+    kept_along,
     leading_axes,
+    planes_of,
+    rows_alone,
     rows_of,
 )
+from btfref.representations.file.pixels import rows_read, whole_file
 from btfref.representations.file.resident import needed_rows, select
 from btfref.representations.file.rows import RowReader
 from btfref.representations.file.validator import check_layout, check_values
@@ -45,6 +47,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
+    from btfref.representations.file.resident import Taken
     from btfref.representations.protocol import Representation
     from btfref.types import Facts, PathLike
 
@@ -83,45 +86,47 @@ def save(representation: Representation, path: PathLike) -> None:
     for name, axes in rows_by.items():
         if axes:
             manifest["arrays"][name]["rows"] = axes
-    images = {name: _stored_image(name, array, rows_by[name]) for name, array in arrays.items()}
+    images = {name: _stored_planes(name, array, rows_by[name]) for name, array in arrays.items()}
+    alone = {name for name, entry in manifest["arrays"].items() if rows_alone(entry)}
     for name, image in images.items():
-        manifest["arrays"][name][KIND_OF_CHECKSUM] = checksums(image)
+        kind = KIND_BY_ROW if name in alone else KIND_OF_CHECKSUM
+        manifest["arrays"][name][kind] = checksums(image, BLOCKS[kind])
     display = (
         np.zeros(2, np.int32),
         np.array(
-            [max(i.shape[1] for i in images.values()) - 1, max(i.shape[0] for i in images.values()) - 1],
+            [
+                max(i[0].shape[1] for i in images.values()) - 1,
+                max(i[0].shape[0] for i in images.values()) - 1,
+            ],
             np.int32,
         ),
     )
     parts: list[OpenEXR.Part] = []
-    for name, image in images.items():
+    for name, planes in images.items():
         header = {
             "name": name,
             "type": OpenEXR.scanlineimage,
-            "compression": OpenEXR.ZIP_COMPRESSION,
+            "compression": OpenEXR.ZIPS_COMPRESSION if name in alone else OpenEXR.ZIP_COMPRESSION,
             "displayWindow": display,
             "dataWindow": (
                 np.zeros(2, np.int32),
-                np.array([image.shape[1] - 1, image.shape[0] - 1], np.int32),
+                np.array([planes[0].shape[1] - 1, planes[0].shape[0] - 1], np.int32),
             ),
         }
         if not parts:
             header |= text_of(manifest)
-        channels = {
-            channel: np.ascontiguousarray(image[..., i])
-            for i, channel in enumerate(channel_names(image.shape[-1]))
-        }
+        channels = dict(zip(channel_names(len(planes)), planes, strict=True))
         parts.append(OpenEXR.Part(header, channels, name))
     with new_file(path) as draft:
         write(parts, draft)
 
 
-def _stored_image(name: str, array: np.ndarray, leading: Sequence[int]) -> np.ndarray:
-    """A map as the image that stands in the file."""
+def _stored_planes(name: str, array: np.ndarray, leading: Sequence[int]) -> list[np.ndarray]:
+    """Channels of a map as the images that stand in the file."""
     if array.dtype.name not in TYPES:
         raise TypeError(f"map {name} must be one of {TYPES}, got {array.dtype}")
-    image = image_of(array, leading)
-    return (image / 255).astype(np.float16) if image.dtype == np.uint8 else image
+    planes = planes_of(array, leading)
+    return [(p / 255).astype(np.float16) for p in planes] if array.dtype == np.uint8 else planes
 
 
 def load(
@@ -157,13 +162,13 @@ def load(
     chosen = any(indices is not None for indices in choice.values())
     manifest, reader = _opened(path)
     with reader:
-        arrays = _read_some(reader, manifest, choice) if chosen else None
+        arrays, taken = (_read_some(reader, manifest, choice) if chosen else None) or (None, None)
     if arrays is None:
-        arrays = _whole_file(path, manifest)
+        arrays = whole_file(path, manifest)
     meta = manifest["meta"]
     kind = method(meta["method"], file=path).representation
     check_values(arrays, manifest, kind, path)
-    arrays, meta = select(arrays, meta, kind, **choice, file=path)
+    arrays, meta = select(arrays, meta, kind, **choice, taken=taken, file=path)
     return kind.from_arrays(arrays, meta)
 
 
@@ -193,8 +198,7 @@ def read_maps(path: PathLike, wanted: Callable[[str], bool]) -> tuple[dict[str, 
             if wanted(name):
                 if not reader.knows(name):
                     raise InputError("a map is missing or compressed in another way", file=path, field=name)
-                pixels = reader.read(name, channel_names(entry["shape"][-1]))
-                arrays[name] = _read_map(path, name, entry, pixels, manifest)
+                arrays[name] = rows_read(reader, name, entry, manifest, {})
     check_values(arrays, manifest, method(manifest["meta"]["method"], file=path).representation, path)
     return arrays, manifest["meta"]
 
@@ -220,8 +224,11 @@ def bytes_of_choice(path: PathLike, choice: Mapping[str, ArrayLike | None]) -> i
 
 def _read_some(
     reader: RowReader, manifest: Facts, choice: Mapping[str, ArrayLike | None]
-) -> dict[str, np.ndarray] | None:
-    """The maps with the rows that a choice needs, or None where reading the whole file takes no longer."""
+) -> tuple[dict[str, np.ndarray], Taken] | None:
+    """The maps with what a choice needs along axes that are rows, and what :func:`select` is told of these axes.
+
+    None where reading the whole file takes no longer.
+    """
     path = reader.path
     kind = method(manifest["meta"]["method"], file=path).representation
     sizes = {
@@ -229,19 +236,19 @@ def _read_some(
         for name, entry in manifest["arrays"].items()
     }
     wanted = needed_rows(kind, manifest, choice)
-    plans = {name: rows_of(manifest["arrays"][name], axes) for name, axes in wanted.items()}
-    if sum(sizes[name] for name, rows in plans.items() if rows is None) > WORTH * sum(sizes.values()):
-        return None
+    entries = manifest["arrays"]
+    plans = {name: rows_of(entries[name], axes) for name, axes in wanted.items()}
     if not all(reader.knows(name) for name in plans):
         return None
-    if sum(sizes[name] * reader.share(name, plans[name]) for name in plans) > WORTH * sum(sizes.values()):
+    shares = {name: reader.share(name, rows, block_of(entries[name])) for name, rows in plans.items()}
+    if sum(sizes[name] * share for name, share in shares.items()) > WORTH * sum(sizes.values()):
         return None
-    arrays = {}
-    for name, rows in plans.items():
-        entry = manifest["arrays"][name]
-        pixels = reader.read(name, channel_names(entry["shape"][-1]), rows)
-        arrays[name] = _read_map(path, name, entry, pixels, manifest, rows)
-    return arrays
+    arrays = {name: rows_read(reader, name, entries[name], manifest, axes) for name, axes in wanted.items()}
+    taken = {
+        name: {axis: entries[name]["shape"][axis] for axis in kept_along(entries[name], axes)}
+        for name, axes in wanted.items()
+    }
+    return arrays, taken
 
 
 def read_info(path: PathLike) -> Facts:
@@ -356,62 +363,3 @@ def _header(path: PathLike) -> Facts:
     manifest, reader = _opened(path)
     reader.close()
     return manifest
-
-
-def _channels_of(path: PathLike, name: str, entry: Facts, part: Any) -> np.ndarray:
-    """Pixels of a part, shape (rows, columns, channels), its channels in the order of the map's."""
-    result = np.zeros(image_of_entry(entry), stored_type(entry))
-    for i, channel in enumerate(channel_names(result.shape[-1])):
-        pixels = part.channels[channel].pixels if channel in part.channels else None
-        if pixels is None or pixels.shape != result.shape[:2] or pixels.dtype != result.dtype:
-            got = "nothing" if pixels is None else f"{pixels.dtype} {pixels.shape}"
-            raise InputError(
-                "a map is damaged",
-                file=path,
-                field=f"{name}.{channel}",
-                got=got,
-                expected=f"{result.dtype} {result.shape[:2]}",
-            )
-        result[..., i] = pixels
-    return result
-
-
-def _whole_file(path: PathLike, manifest: Facts) -> dict[str, np.ndarray]:
-    """All maps, by OpenEXR."""
-    try:
-        # Channels stay apart: RGB grouping would reorder those of maps with many channels.
-        with opened(path, separate_channels=True) as file:
-            parts = {part.header.get("name", ""): part for part in file.parts}
-            return {
-                name: _read_map(path, name, entry, _channels_of(path, name, entry, parts[name]), manifest)
-                for name, entry in manifest["arrays"].items()
-            }
-    except InputError:
-        raise
-    except (RuntimeError, ValueError, TypeError, OSError, KeyError, IndexError) as error:
-        raise InputError(f"damaged or truncated OpenEXR file: {error}", file=path) from error
-
-
-def _read_map(
-    path: PathLike,
-    name: str,
-    entry: Facts,
-    image: np.ndarray,
-    manifest: Facts,
-    rows: np.ndarray | None = None,
-) -> np.ndarray:
-    """A map from the pixels of its image, of which `rows` were read, checked."""
-    refuse_changed(path, name, entry, image, rows)
-    # What a partial table lacks stands in it as NaN, and gives NaN where it is asked for.
-    partial = manifest["meta"].get("partial", False) and not name.startswith(("view_", "light_"))
-    broken = np.isinf if partial else lambda values: ~np.isfinite(values)
-    if image.dtype.kind == "f" and broken(image).any():
-        raise InputError("a map holds a value that is not finite", file=path, field=name)
-    if entry["dtype"] == "uint8":
-        if ((image < 0) | (image > 1)).any():
-            raise InputError(
-                "an 8-bit map holds a value out of range", file=path, field=name, expected="[0, 1]"
-            )
-        image = np.rint(image.astype(np.float32) * 255).astype(np.uint8)
-    result, leading = image.reshape(file_shape(entry)), entry.get("rows", [])
-    return np.ascontiguousarray(np.moveaxis(result, range(len(leading)), leading)) if leading else result

@@ -20,7 +20,7 @@ from btfref.errors import InputError
 from btfref.representations.file.map_images import BLOCK, file_shape, image_size
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from btfref.representations.file.rows import RowReader
     from btfref.types import Facts, PathLike
@@ -30,6 +30,12 @@ ATTRIBUTE, CHECKSUM = "btfref", "btfref_crc32"
 
 #: What the manifest says where the file has checksums; files of earlier versions lack them.
 KIND_OF_CHECKSUM = "crc32"
+
+#: The same of every row, of maps whose rows are read alone.
+KIND_BY_ROW = "crc32_rows"
+
+#: Rows of a block by the key of its checksums.
+BLOCKS = {KIND_OF_CHECKSUM: BLOCK, KIND_BY_ROW: 1}
 
 #: Types of maps; OpenEXR has no 8-bit channels, see :mod:`btfref.representations.file.map_images`.
 TYPES = ("float16", "float32", "uint32", "uint8")
@@ -203,11 +209,12 @@ def _check_entry(entry: _Fields) -> None:
         rows = entry.wholes("rows", 0, len(shape) - 2, range(1, len(shape)))
         if len(set(rows)) != len(rows):
             entry.refuse("rows", rows, "axes that differ")
-    if KIND_OF_CHECKSUM in entry.data:
-        blocks = -(-image_of_entry(entry.data)[0] // BLOCK)
-        text = entry.text(KIND_OF_CHECKSUM)
-        if len(text) != 8 * blocks or re.fullmatch(r"[0-9a-f]+", text) is None:
-            entry.refuse(KIND_OF_CHECKSUM, text, f"{8 * blocks} hexadecimal digits")
+    for kind, block in BLOCKS.items():
+        if kind in entry.data:
+            blocks = -(-image_of_entry(entry.data)[0] // block)
+            text = entry.text(kind)
+            if len(text) != 8 * blocks or re.fullmatch(r"[0-9a-f]+", text) is None:
+                entry.refuse(kind, text, f"{8 * blocks} hexadecimal digits")
 
 
 def _check_size(fields: _Fields, file_bytes: int) -> None:
@@ -235,19 +242,22 @@ def stored_type(entry: Facts) -> np.dtype:
     return np.dtype("float16" if entry["dtype"] == "uint8" else entry["dtype"])
 
 
-def checksums(image: np.ndarray) -> str:
+def checksums(planes: Sequence[np.ndarray], block: int = BLOCK) -> str:
     """Checksums of the blocks of rows of an image, eight hexadecimal digits each.
 
     Parameters
     ----------
-    image : ndarray, shape (rows, columns, channels)
-        As it is stored.
+    planes : sequence of ndarray, shape (rows, columns)
+        Its channels, as they are stored.
+    block : int
+        Rows of a block.
 
     Returns
     -------
     str
     """
-    return "".join(_checksum(image[first : first + BLOCK]) for first in range(0, len(image), BLOCK))
+    starts = range(0, len(planes[0]), block)
+    return "".join(_checksum(np.stack([p[first : first + block] for p in planes], -1)) for first in starts)
 
 
 def _checksum(block: np.ndarray) -> str:
@@ -255,10 +265,13 @@ def _checksum(block: np.ndarray) -> str:
     return f"{zlib.crc32(little.reshape(-1).view(np.uint8).data):08x}"
 
 
-def refuse_changed(
-    path: PathLike, name: str, entry: Facts, image: np.ndarray, rows: np.ndarray | None = None
-) -> None:
-    """InputError for an image whose pixels are not those that were written.
+def block_of(entry: Facts) -> int:
+    """Rows of a map's image that one checksum is of, and that are read together."""
+    return next((block for kind, block in BLOCKS.items() if kind in entry), BLOCK)
+
+
+def refuse_changed(path: PathLike, name: str, entry: Facts, number: int, pixels: np.ndarray) -> None:
+    """InputError for a block of an image whose pixels are not those that were written.
 
     Parameters
     ----------
@@ -267,21 +280,18 @@ def refuse_changed(
         Of the map.
     entry : dict
         What the manifest says of it; without checksums, as in files of earlier versions, nothing is refused.
-    image : ndarray, shape (rows, columns, channels)
-    rows : ndarray of int, optional
-        Those that were read; all by default.
+    number : int
+        Of the block.
+    pixels : ndarray, shape (rows, columns, channels)
     """
-    text = entry.get(KIND_OF_CHECKSUM)
+    text = next((entry[kind] for kind in BLOCKS if kind in entry), None)
     if text is None:
         return
-    blocks = range(-(-len(image) // BLOCK)) if rows is None else np.unique(np.asarray(rows) // BLOCK)
-    for block in blocks:
-        found = _checksum(image[block * BLOCK : (block + 1) * BLOCK])
-        expected = text[8 * block : 8 * (block + 1)]
-        if found != expected:
-            raise InputError(
-                "a map is damaged: its checksum differs", file=path, field=name, got=found, expected=expected
-            )
+    found, expected = _checksum(pixels), text[8 * number : 8 * (number + 1)]
+    if found != expected:
+        raise InputError(
+            "a map is damaged: its checksum differs", file=path, field=name, got=found, expected=expected
+        )
 
 
 def check_parts(manifest: Facts, reader: RowReader, path: PathLike) -> None:

@@ -8,6 +8,7 @@ asks for it (:class:`~btfref.representations.protocol.KeepsRows`): those rows ca
 
 from __future__ import annotations
 
+import math
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,9 @@ MAXIMUM_WIDTH = 8192
 
 #: Rows of an image that belong together: those that OpenEXR compresses in one go, and that one checksum is of.
 BLOCK = 16
+
+#: Bytes of a row from which on it may be compressed alone: shorter ones would cost more than they save.
+LEAST_LINE = 1024
 
 
 def image_size(shape: Sequence[int], leading: int = 0) -> tuple[int, int]:
@@ -46,10 +50,11 @@ def leading_axes(made: object, name: str) -> list[int]:
     return next((list(axes) for pattern, axes in patterns.items() if fnmatchcase(name, pattern)), [])
 
 
-def image_of(array: np.ndarray, leading: Sequence[int]) -> np.ndarray:
-    """A map as an image, its leading axes first."""
+def planes_of(array: np.ndarray, leading: Sequence[int]) -> list[np.ndarray]:
+    """Channels of a map as images, its leading axes first."""
     moved = np.moveaxis(array, leading, range(len(leading)))
-    return moved.reshape(*image_size(moved.shape, len(leading)), moved.shape[-1])
+    size = image_size(moved.shape, len(leading))
+    return [np.ascontiguousarray(moved[..., i]).reshape(size) for i in range(moved.shape[-1])]
 
 
 def file_shape(entry: Facts) -> list[int]:
@@ -64,18 +69,31 @@ def channel_names(n: int) -> list[str]:
     return {1: ["Y"], 3: ["R", "G", "B"]}.get(n, [f"c{i:04d}" for i in range(n)])
 
 
-def rows_of(entry: Facts, axes: Mapping[int, np.ndarray]) -> np.ndarray | None:
-    """Rows of a map's image that hold the chosen indices of its axes; None for all."""
-    leading = entry.get("rows", [])
-    if not any(axis in axes for axis in leading):
-        return None
+def rows_alone(entry: Facts) -> bool:
+    """Whether a row of a map's image is compressed alone: where fewer rows than a block belong to the same indices."""
+    leading = len(entry.get("rows", ()))
     shape = file_shape(entry)
+    height, width = image_size(shape, leading)
+    line = width * shape[-1] * np.dtype(entry["dtype"]).itemsize
+    return leading > 0 and height // math.prod(shape[:leading]) < BLOCK and line >= LEAST_LINE
+
+
+def kept_along(entry: Facts, axes: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
+    """Of the chosen indices by axis those that :func:`rows_of` leaves, ascending: axes that are rows of the image."""
+    shape, leading = entry["shape"], entry.get("rows", ())
+    found = {axis: np.unique(axes[axis]) for axis in leading if axis in axes}
+    return {axis: kept[(kept >= 0) & (kept < shape[axis])] for axis, kept in found.items()}
+
+
+def rows_of(entry: Facts, axes: Mapping[int, np.ndarray]) -> np.ndarray | None:
+    """Rows of a map's image that hold the chosen indices of its axes, ascending; None for all."""
+    kept = kept_along(entry, axes)
+    if not kept:
+        return None
+    shape, leading = file_shape(entry), entry["rows"]
     height, _ = image_size(shape, len(leading))
-    chosen = np.ones([shape[i] for i in range(len(leading))], bool)
-    for i, axis in enumerate(leading):
-        if axis in axes:
-            mask = np.zeros(shape[i], bool)
-            inside = axes[axis][(axes[axis] >= 0) & (axes[axis] < shape[i])]
-            mask[inside] = True
-            chosen &= np.expand_dims(mask, [k for k in range(len(leading)) if k != i])
+    chosen = np.zeros(shape[: len(leading)], bool)
+    chosen[np.ix_(*(kept.get(axis, np.arange(n)) for axis, n in zip(leading, chosen.shape, strict=True)))] = (
+        True
+    )
     return np.flatnonzero(np.repeat(chosen.ravel(), height // chosen.size))

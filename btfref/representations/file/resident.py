@@ -14,6 +14,7 @@ A lookup that needs what is not there is an error in NumPy and not a number in t
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
@@ -24,13 +25,16 @@ from btfref.numerics.sphere.interpolation import MISSING
 from btfref.representations.protocol import HasEntries, HasLevels, Kind, direction_axes
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import ArrayLike
 
     from btfref.representations.protocol import Entries, Representation
     from btfref.types import Facts, PathLike
 
+
+#: By map the axes along which it was read in part, and how many indices these have in the file.
+Taken = Mapping[str, Mapping[int, int]]
 
 #: Kinds of directions.
 KINDS: tuple[Kind, ...] = ("view", "light")
@@ -103,11 +107,16 @@ def select(
     lights: ArrayLike | None = None,
     entries: ArrayLike | None = None,
     levels: ArrayLike | None = None,
+    taken: Taken | None = None,
     file: PathLike | None = None,
 ) -> tuple[dict[str, np.ndarray], Facts]:
-    """Arrays and meta of class ``made`` with what was chosen; see :func:`keeping`."""
+    """Arrays and meta of class ``made`` with what was chosen; see :func:`keeping`.
+
+    Along the axes in ``taken`` a map was read in part: it has what was chosen and no more already.
+    """
+    taken = taken or {}
     if entries is not None:
-        arrays, meta = _with_entries(arrays, meta, made, entries, file)
+        arrays, meta = _with_entries(arrays, meta, made, entries, taken, file)
     if levels is not None:
         arrays, meta = _with_levels(arrays, meta, made, levels, file)
     for kind, chosen in zip(KINDS, (views, lights), strict=True):
@@ -118,7 +127,7 @@ def select(
                     "directions are not interpolated", file=file, field=f"{kind}s", got=meta["method"]
                 )
             axes = axes_of(made, meta["method"], kind, file=file)
-            arrays, meta = _selected(arrays, meta, axes, kind, chosen, file)
+            arrays, meta = _selected(arrays, meta, axes, kind, chosen, taken, file)
     return arrays, meta
 
 
@@ -139,20 +148,27 @@ def axes_of(
 
 
 def _with_entries(
-    arrays: dict[str, np.ndarray], meta: Facts, made: object, entries: ArrayLike, file: PathLike | None
+    arrays: dict[str, np.ndarray],
+    meta: Facts,
+    made: object,
+    entries: ArrayLike,
+    taken: Taken,
+    file: PathLike | None,
 ) -> tuple[dict[str, np.ndarray], Facts]:
     names = entries_of(made, meta["method"], file=file)
-    sizes = [arrays[name].shape[axis] for name, axis in names.axes.items()]
     if "resident_entries" in meta:
         raise InputError("entries are chosen already", file=file, field="entries", got=meta["method"])
-    kept = _checked("entries", entries, sizes[0], file)
-    slots = slots_of(sizes[0], kept)
+    first, axis = next(iter(names.axes.items()))
+    total = taken.get(first, {}).get(axis, arrays[first].shape[axis])
+    kept = _checked("entries", entries, total, file)
+    slots = slots_of(total, kept)
     place = slots[:, 0][arrays[names.index]]
     lost = place == MISSING
     mark = np.where(lost, np.array(np.nan, arrays[names.mark].dtype), arrays[names.mark])
     result = {**arrays, names.index: np.where(lost, np.uint32(0), place), names.mark: mark}
     for name, axis in names.axes.items():
-        result[name] = np.ascontiguousarray(np.take(arrays[name], kept, axis))
+        if axis not in taken.get(name, ()):
+            result[name] = np.ascontiguousarray(np.take(arrays[name], kept, axis))
     return result, {**meta, "resident_entries": kept.tolist(), "partial": bool(lost.any())}
 
 
@@ -264,6 +280,7 @@ def _selected(
     axes: Mapping[str, int],
     kind: Kind,
     chosen: ArrayLike,
+    taken: Taken,
     file: PathLike | None,
 ) -> tuple[dict[str, np.ndarray], Facts]:
     field, total = f"{kind}s", meta[f"{kind}s"]["count"]
@@ -281,7 +298,8 @@ def _selected(
     result = {}
     for name, array in arrays.items():
         axis = next((a for pattern, a in axes.items() if fnmatchcase(name, pattern)), None)
-        result[name] = array if axis is None else np.ascontiguousarray(np.take(array, kept, axis))
+        there = axis is None or axis in taken.get(name, ())
+        result[name] = array if there else np.ascontiguousarray(np.take(array, kept, axis))
     result[slots_name(kind)] = slots_of(total, chosen)
     return result, {**meta, f"resident_{field}": chosen.tolist()}
 

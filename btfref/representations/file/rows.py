@@ -19,7 +19,7 @@ from btfref.errors import InputError
 from btfref.representations.file.map_images import BLOCK
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from typing import Self
 
     from numpy.typing import ArrayLike
@@ -113,19 +113,23 @@ class RowReader:
         """Whether a part is there, of scan lines in a compression that is read here."""
         return name in self.parts and self.parts[name].simple
 
-    def share(self, name: str, rows: ArrayLike | None = None) -> float:
-        """Share of a part's chunks that hold some rows: what :meth:`read` reads of it."""
+    def share(self, name: str, rows: ArrayLike | None = None, block: int = BLOCK) -> float:
+        """Share of a part's lines that :meth:`read` reads for some rows."""
         part = self.parts[name]
-        return 1.0 if rows is None else len(self._chunks(part, rows)) / part.chunks
+        if rows is None:
+            return 1.0
+        unit = max(block, part.lines)
+        return min(1.0, len(np.unique(np.asarray(rows) // unit)) * unit / part.rows)
 
-    @staticmethod
-    def _chunks(part: PartHeader, rows: ArrayLike) -> np.ndarray:
-        """Chunks of the blocks that hold some rows: checksums are of whole blocks."""
-        blocks, each = np.unique(np.asarray(rows) // BLOCK), BLOCK // part.lines
-        chunks = (blocks[:, None] * each + np.arange(each)).ravel()
-        return chunks[chunks < part.chunks]
-
-    def read(self, name: str, channels: Sequence[str], rows: ArrayLike | None = None) -> np.ndarray:
+    def read(
+        self,
+        name: str,
+        channels: Sequence[str],
+        rows: ArrayLike | None = None,
+        *,
+        block: int = BLOCK,
+        check: Callable[[int, np.ndarray], object] = lambda number, pixels: None,
+    ) -> np.ndarray:
         """Pixels of a part.
 
         Parameters
@@ -134,12 +138,16 @@ class RowReader:
         channels : list of str
             In the order of the result.
         rows : array_like of int, optional
-            Rows to read, in any order; default all. Others of their blocks of `BLOCK` rows are filled too.
+            Rows to read, ascending; default all.
+        block : int
+            Rows of a block, 1 or `BLOCK`: of each that holds such rows all are read.
+        check : callable
+            Called with the number and the pixels (rows, columns, channels) of each block.
 
         Returns
         -------
         ndarray, shape (rows, columns, channels)
-            Rows that were not read are 0.
+            Of the rows that were asked for, and of no others.
 
         Raises
         ------
@@ -153,25 +161,39 @@ class RowReader:
             )
         assert part.kind is not None
         place = [part.channels.index(channel) for channel in channels]
-        wanted = np.arange(part.chunks) if rows is None else self._chunks(part, rows)
+        wanted = np.arange(part.rows) if rows is None else np.asarray(rows, np.int64)
         self._stream.seek(part.offsets)
         table = np.frombuffer(self._take(8 * part.chunks), "<u8")
-        result = np.zeros((part.rows, part.columns, len(channels)), part.kind)
-        line = part.columns * len(channels) * part.kind.itemsize
-        for chunk in wanted:
-            first = int(chunk) * part.lines
-            count = min(part.lines, part.rows - first)
-            self._stream.seek(int(table[chunk]))
-            _, row, size = struct.unpack("<iii", self._take(12))
-            if row != first or not 0 <= size <= count * line:
-                raise self._damaged(f"chunk {chunk} of {name}")
-            stored = self._take(size)
-            whole = size == count * line
-            data = np.frombuffer(stored, np.uint8) if whole else self._inflated(stored, count * line)
-            # Of each line one channel after the other.
-            pixels = data.view(part.kind).reshape(count, len(channels), part.columns)
-            result[first : first + count] = np.moveaxis(pixels[:, place], 1, -1)
+        result = np.zeros((len(wanted), part.columns, len(channels)), part.kind)
+        unit = max(block, part.lines)
+        units, starts = np.unique(wanted // unit, return_index=True)
+        for number, start, stop in zip(units, starts, [*starts, len(wanted)][1:], strict=True):
+            first = int(number) * unit
+            chunks = range(first // part.lines, min((first + unit) // part.lines, part.chunks))
+            pixels = [self._chunk(name, table, chunk, place) for chunk in chunks]
+            lines = pixels[0] if len(pixels) == 1 else np.concatenate(pixels)
+            inside = wanted[start:stop] - first
+            for k in np.unique(inside // block):
+                check(first // block + int(k), lines[k * block : (k + 1) * block])
+            result[start:stop] = lines if len(inside) == len(lines) else lines[inside]
         return result
+
+    def _chunk(self, name: str, table: np.ndarray, chunk: int, place: list[int]) -> np.ndarray:
+        """Pixels of a chunk, (lines, columns, channels)."""
+        part = self.parts[name]
+        assert part.kind is not None
+        first, line = chunk * part.lines, part.columns * len(place) * part.kind.itemsize
+        count = min(part.lines, part.rows - first)
+        self._stream.seek(int(table[chunk]))
+        _, row, size = struct.unpack("<iii", self._take(12))
+        if row != first or not 0 <= size <= count * line:
+            raise self._damaged(f"chunk {chunk} of {name}")
+        stored = self._take(size)
+        whole = size == count * line
+        data = np.frombuffer(stored, np.uint8) if whole else self._inflated(stored, count * line)
+        # Of each line one channel after the other.
+        pixels = data.view(part.kind).reshape(count, len(place), part.columns)
+        return np.ascontiguousarray(np.moveaxis(pixels[:, place], 1, -1))
 
     def _inflated(self, data: bytes, size: int) -> np.ndarray:
         try:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,13 +9,14 @@ import numpy as np
 from btfref.errors import InputError
 from btfref.numerics.phong import fit_phong, phong
 from btfref.numerics.pyramid import level_shapes
-from btfref.numerics.solvers.streaming import OVERSAMPLING, ROWS, GramPass
-from btfref.numerics.solvers.threads import product, reproducible
+from btfref.numerics.solvers.streaming import OVERSAMPLING, GramPass
+from btfref.numerics.solvers.threads import reproducible
 from btfref.numerics.ycbcr import CHANNELS, RGB_METRIC, RGB_WEIGHT
 from btfref.representations.analytic.light_functions import edge_constants
 from btfref.representations.columns import Steps
 from btfref.representations.laplacian.images import PyramidImages, expanded
 from btfref.representations.laplacian.levels import Representation, level_constants
+from btfref.representations.laplacian.rests import Exact, Model, gram, rest_gram, rest_products
 from btfref.representations.lookup import base_meta, direction_arrays, stored, unit_peaks
 
 if TYPE_CHECKING:
@@ -206,11 +206,16 @@ def _first_pass(images: PyramidImages) -> tuple[list[np.ndarray], np.ndarray]:
     """Inner products of the channels at each level (3, 3), and the mean of the coarsest, (pairs, 3) float64."""
     energy = [np.zeros((3, 3)) for _ in images.shapes]
     means = []
-    for levels in images.fill():
-        for total, image in zip(energy, levels, strict=True):
-            total += _gram(list(np.moveaxis(image, 1, 0)))
-        means.append(levels[-1].mean(2, dtype=float))
+    for grams, mean in images.fill(_grams_and_mean, None):
+        for total, own in zip(energy, grams, strict=True):
+            total += own
+        means.append(mean)
     return energy, np.concatenate(means)
+
+
+def _grams_and_mean(_: None, part: slice, levels: Images) -> tuple[list[np.ndarray], np.ndarray]:
+    """What :func:`_first_pass` wants of a block."""
+    return [gram(list(np.moveaxis(image, 1, 0))) for image in levels], levels[-1].mean(2, dtype=float)
 
 
 def _mean_maps(
@@ -264,7 +269,7 @@ class _Levels:
         rng: np.random.Generator,
     ) -> None:
         self.images, self.closed = images, closed
-        self.energy = [float((RGB_METRIC * gram).sum()) for gram in energy]
+        self.energy = [float((RGB_METRIC * own).sum()) for own in energy]
         self.filter_type, self.storage, self.n_views, self.rng = filter_type, storage, n_views, rng
         self.maps: dict[str, np.ndarray] = {}
         self.level_errors: dict[int, float] = {}
@@ -284,17 +289,6 @@ class _Levels:
             tables.append((np.concatenate(basis, 1), np.concatenate(weights)))
         return Model(tables)
 
-    def _exact(self, k: int, part: slice, images: Images) -> list[np.ndarray]:
-        """Differences of level k to the exact coarser ones, [channel] (pairs, texels)."""
-        shapes = self.images.shapes
-        rests: list[tuple[int, np.ndarray]] = []
-        for j in range(len(shapes) - 1, k - 1, -1):
-            rest = images[j - k] - self.average[part, :, None]
-            for i, coarser in rests:
-                rest -= expanded(coarser, shapes[i], shapes[j], self.filter_type)
-            rests.append((j, rest))
-        return [np.ascontiguousarray(rests[-1][1][:, c]) for c in range(3)]
-
     def compress(self, k: int, counts: tuple[int, int, int] | None, target: float | None) -> list[int]:
         """Compress level k to the given numbers of components, or to as few as reach the target; returns them."""
         energy, texels = self.energy[k], self.images.texels(k)
@@ -311,13 +305,13 @@ class _Levels:
             parts = [self._stored(k, *part, n) for part, n in zip(ranges, own, strict=True)]
             self.kept = [list(kept) for kept in coarser]
             self._keep(k, parts)
-            gram = self._left(k)
-            error = float((RGB_METRIC * gram).sum())
+            left = self._left(k)
+            error = float((RGB_METRIC * left).sum())
             if target is None or error <= allowed or aimed == 0:
                 break
             # Channels' errors are correlated and stored maps are rounded: aim lower.
             aimed = 0.9 * aimed if aimed > 1e-6 * allowed else 0.0
-        self.gram = gram / (texels * self.images.n_pairs)
+        self.gram = left / (texels * self.images.n_pairs)
         self.level_errors[k] = np.sqrt(error / energy) if energy > 0 else 0.0
         return [int(n) for n in own]
 
@@ -327,16 +321,20 @@ class _Levels:
         bases = [
             self.rng.standard_normal((n, min(r + OVERSAMPLING, n, d) if r else 0), np.float32) for r in ranks
         ]
-        model, squares = self._model(k), np.zeros(3)
+        squares = np.zeros(3)
+        model: Model | Exact = self._model(k)
+        if not self.closed:
+            model = Exact(self.average, self.images.shapes[k:], self.filter_type)
         for turn in range(PASSES):
             steps = [GramPass(basis, d) for basis in bases]
-            for part, images in self.images.blocks(k):
-                rests = model.rests(part, images[0]) if self.closed else self._exact(k, part, images)
-                for step, rest in zip(steps, rests, strict=True):
-                    if step.basis.shape[1]:
-                        step.add(part, rest)
-                if turn == 0:
-                    squares += np.array([np.einsum("ij,ij->i", r, r).sum(dtype=float) for r in rests])
+            task = model, [step.basis for step in steps], turn == 0
+            blocks = self.images.over(k, rest_products, task, coarser=not self.closed)
+            for part, (products, own) in blocks:
+                for step, found in zip(steps, products, strict=True):
+                    if found is not None:
+                        step.add(part, *found)
+                if own is not None:
+                    squares += own
             if turn < PASSES - 1:
                 bases = [step.next_basis() if step.basis.shape[1] else step.basis for step in steps]
         none = np.zeros((0, d), np.float32), np.zeros((n, 0), np.float32)
@@ -344,10 +342,10 @@ class _Levels:
 
     def _left(self, k: int) -> np.ndarray:
         """Inner products of what the stored levels leave of level k, by channel."""
-        model, gram = self._model(k), np.zeros((3, 3))
-        for part, images in self.images.blocks(k):
-            gram += _gram(model.rests(part, images[0]))
-        return gram
+        left = np.zeros((3, 3))
+        for _, own in self.images.over(k, rest_gram, self._model(k)):
+            left += own
+        return left
 
     def _stored(self, k: int, basis: np.ndarray, coordinate: np.ndarray, n: int) -> StoredChannel:
         """Weights and basis of the first components as they are stored."""
@@ -374,25 +372,6 @@ class _Levels:
             "levels": [float(self.level_errors[k]) for k in sorted(self.level_errors)],
             "mse": dict(zip(CHANNELS, np.diag(self.gram).tolist(), strict=True)),
         }
-
-
-@dataclass(frozen=True)
-class Model:
-    """Images as tables of pairs times weights of texels, [channel] ((pairs, m), (m, texels)), float32."""
-
-    tables: list[tuple[np.ndarray, np.ndarray]]
-
-    def rests(self, part: slice, images: np.ndarray) -> list[np.ndarray]:
-        """Differences of images (pairs, channel, texels) to the model, [channel] (pairs, texels)."""
-        return [
-            images[:, channel] - product(basis[part], weights, rows=ROWS)
-            for channel, (basis, weights) in enumerate(self.tables)
-        ]
-
-
-def _gram(arrays: Sequence[np.ndarray]) -> np.ndarray:
-    """Inner products of the channels' arrays, shape (3, 3), in float64 by rows."""
-    return np.array([[np.einsum("ij,ij->i", a, b).sum(dtype=float) for b in arrays] for a in arrays])
 
 
 def _fewest(squares: np.ndarray, coordinates: list[np.ndarray], allowed: float, level: int) -> list[int]:

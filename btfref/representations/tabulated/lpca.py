@@ -8,7 +8,7 @@ VMV 2003; the same authors, "Fast Environmental Lighting for Local-PCA Encoded B
 
 from __future__ import annotations
 
-from functools import partial
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -287,25 +287,16 @@ class ClusterBases:
         means = np.zeros((self.clusters, d), np.float32)
         samples = {k: np.zeros((d, start.shape[1]), np.float32) for k, start in self.starts.items()}
 
-        def sample(columns: slice, block: np.ndarray, k: int) -> None:
-            members = block[:, self.parts[k]]
-            means[k, columns] = members.mean(1)
-            members -= means[k, columns, None]
-            samples[k][columns] = members @ self.starts[k]
-
-        for columns, block in matrix.blocks():
-            in_parallel(partial(sample, columns, block), self.used)
+        task = _Members(self.parts, self.starts)
+        for columns, (own_means, own) in matrix.over(_sampled, task):
+            for k in self.used:
+                means[k, columns], samples[k][columns] = own_means[k], own[k]
         spans = {k: orthonormal(found) for k, found in samples.items()}
         projected = {k: np.zeros((self.parts[k].stop - self.parts[k].start, span.shape[1]))
                      for k, span in spans.items()}  # fmt: skip
-
-        def project(columns: slice, block: np.ndarray, k: int) -> None:
-            members = block[:, self.parts[k]]
-            members -= means[k, columns, None]
-            projected[k] += members.T @ spans[k][columns]
-
-        for columns, block in matrix.blocks():
-            in_parallel(partial(project, columns, block), self.used)
+        for _, own in matrix.over(_projected, (_Members(self.parts, spans), means)):
+            for k in self.used:
+                projected[k] += own[k]
         axes = np.zeros((self.clusters, self.components, d), np.float32)
         weights = np.zeros((n, self.components), np.float32)
         error = 0.0
@@ -317,3 +308,42 @@ class ClusterBases:
             error += squares[members].sum() - len(members) * float(means[k].astype(float) @ means[k])
             error -= float((weights[members].astype(float) ** 2).sum())
         return means, axes, weights, max(error, 0.0)
+
+
+@dataclass(frozen=True)
+class _Members:
+    """Each cluster's part of the ordered texels, and by cluster that has some what their vectors are multiplied by."""
+
+    parts: list[slice]
+    factors: dict[int, np.ndarray]
+
+
+def _sampled(
+    task: _Members, columns: slice, block: np.ndarray
+) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
+    """By cluster the members' means over a block's columns, (columns,), and the rest times the factors."""
+    means: dict[int, np.ndarray] = {}
+    samples: dict[int, np.ndarray] = {}
+
+    def sample(k: int) -> None:
+        members = block[:, task.parts[k]]
+        means[k] = members.mean(1)
+        members -= means[k][:, None]
+        samples[k] = members @ task.factors[k]
+
+    in_parallel(sample, task.factors)
+    return means, samples
+
+
+def _projected(task: tuple[_Members, np.ndarray], columns: slice, block: np.ndarray) -> dict[int, np.ndarray]:
+    """By cluster the members' vectors less the mean times the factors, as far as a block's columns go, (n, w)."""
+    members_of, means = task
+    result: dict[int, np.ndarray] = {}
+
+    def project(k: int) -> None:
+        members = block[:, members_of.parts[k]]
+        members -= means[k, columns, None]
+        result[k] = members.T @ members_of.factors[k][columns]
+
+    in_parallel(project, members_of.factors)
+    return result

@@ -43,6 +43,7 @@ class Representation(StoredMaps):
     """Table ``values`` [row, column, view, light, 3] and the directions it is sampled at."""
 
     DIRECTION_AXES: ClassVar = {"view": {"values": 2}, "light": {"values": 3}}
+    ROWS_BY: ClassVar = {"values": (2, 3)}
     DRAWS_VIEWS: ClassVar = True
 
     @classmethod

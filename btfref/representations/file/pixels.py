@@ -1,0 +1,102 @@
+"""Maps from the pixels of a file, checked: of all parts by OpenEXR, or of some rows."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from btfref.errors import InputError
+from btfref.images.openexr import opened
+from btfref.representations.file.manifest import block_of, image_of_entry, refuse_changed, stored_type
+from btfref.representations.file.map_images import channel_names, file_shape, kept_along, rows_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from btfref.representations.file.rows import RowReader
+    from btfref.types import Facts, PathLike
+
+
+def _planes_of(path: PathLike, name: str, entry: Facts, part: Any) -> list[np.ndarray]:
+    """Channels of a part in the order of the map's, each (rows, columns)."""
+    rows, columns, n_channels = image_of_entry(entry)
+    planes, kind = [], stored_type(entry)
+    for channel in channel_names(n_channels):
+        pixels = part.channels[channel].pixels if channel in part.channels else None
+        if pixels is None or pixels.shape != (rows, columns) or pixels.dtype != kind:
+            got = "nothing" if pixels is None else f"{pixels.dtype} {pixels.shape}"
+            raise InputError(
+                "a map is damaged",
+                file=path,
+                field=f"{name}.{channel}",
+                got=got,
+                expected=f"{kind} {(rows, columns)}",
+            )
+        planes.append(pixels)
+    return planes
+
+
+def whole_file(path: PathLike, manifest: Facts) -> dict[str, np.ndarray]:
+    """All maps, by OpenEXR."""
+    try:
+        # Channels stay apart: RGB grouping would reorder those of maps with many channels.
+        with opened(path, separate_channels=True) as file:
+            parts = {part.header.get("name", ""): part for part in file.parts}
+            return {
+                name: _read_map(path, name, entry, _planes_of(path, name, entry, parts[name]), manifest)
+                for name, entry in manifest["arrays"].items()
+            }
+    except InputError:
+        raise
+    except (RuntimeError, ValueError, TypeError, OSError, KeyError, IndexError) as error:
+        raise InputError(f"damaged or truncated OpenEXR file: {error}", file=path) from error
+
+
+def rows_read(
+    reader: RowReader, name: str, entry: Facts, manifest: Facts, axes: Mapping[int, np.ndarray]
+) -> np.ndarray:
+    """A map, of which only the chosen indices along axes that are rows are read, checked."""
+    pixels = reader.read(
+        name,
+        channel_names(entry["shape"][-1]),
+        rows_of(entry, axes),
+        block=block_of(entry),
+        check=partial(refuse_changed, reader.path, name, entry),
+    )
+    shape = file_shape(entry)
+    for axis, kept in kept_along(entry, axes).items():
+        shape[entry["rows"].index(axis)] = len(kept)
+    return _as_map(reader.path, name, entry, pixels.reshape(shape), manifest)
+
+
+def _read_map(
+    path: PathLike, name: str, entry: Facts, planes: list[np.ndarray], manifest: Facts
+) -> np.ndarray:
+    """A map from the channels of its image, checked."""
+    block = block_of(entry)
+    image = np.zeros((*planes[0].shape, len(planes)), planes[0].dtype)
+    for number, first in enumerate(range(0, len(image), block)):
+        lines = image[first : first + block]
+        for i, plane in enumerate(planes):
+            lines[..., i] = plane[first : first + block]
+        refuse_changed(path, name, entry, number, lines)
+    return _as_map(path, name, entry, image.reshape(file_shape(entry)), manifest)
+
+
+def _as_map(path: PathLike, name: str, entry: Facts, pixels: np.ndarray, manifest: Facts) -> np.ndarray:
+    """A map from its pixels with the axes in the order of the file, checked."""
+    # What a partial table lacks stands in it as NaN, and gives NaN where it is asked for.
+    partly = manifest["meta"].get("partial", False) and not name.startswith(("view_", "light_"))
+    broken = np.isinf if partly else lambda values: ~np.isfinite(values)
+    if pixels.dtype.kind == "f" and broken(pixels).any():
+        raise InputError("a map holds a value that is not finite", file=path, field=name)
+    if entry["dtype"] == "uint8":
+        if ((pixels < 0) | (pixels > 1)).any():
+            raise InputError(
+                "an 8-bit map holds a value out of range", file=path, field=name, expected="[0, 1]"
+            )
+        pixels = np.rint(pixels.astype(np.float32) * 255).astype(np.uint8)
+    leading = entry.get("rows", [])
+    return np.ascontiguousarray(np.moveaxis(pixels, range(len(leading)), leading)) if leading else pixels
