@@ -181,7 +181,9 @@ def blocks(
         return Blocks(min(buffer, BUFFER_RANGE[1]), 1, n_lights)
     from btfref.sampling.surface import budget as surface
 
-    free -= surface.BASE + QUEUE
+    # Means and variances of the whole BTF may be less than what may wait.
+    queue = min(QUEUE, 2 * 12 * n_views * n_lights * texels[0] * texels[1])
+    free -= surface.BASE + queue
     fitting = partial(
         surface.largest,
         free,
@@ -198,7 +200,7 @@ def blocks(
     if isinstance(size, int):
         refuse(budget, budget - free + size)
     views, lights, buffer = size
-    return Blocks(buffer, views, lights, QUEUE)
+    return Blocks(buffer, views, lights, queue)
 
 
 def refuse(budget: int, least: int, *, what: str = "memory budget too small for these settings") -> NoReturn:

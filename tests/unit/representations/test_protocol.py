@@ -16,7 +16,7 @@ OUTSIDE = Path(__file__).parents[2] / "third_party" / "tinted_brdf"
 REPRESENTATIONS = {
     "KeepsDirections": {"raw", "svd", "lpca", "laplacian", "rf_poly", "rf_lobes", "lafortune_lut"},
     "HasEntries": {"lpca", "gbrdf"},
-    "KeepsRows": {"svd", "lpca", "laplacian", "rf_poly", "rf_lobes"},
+    "KeepsRows": {"raw", "svd", "lpca", "laplacian", "rf_poly", "rf_lobes"},
     "HasLevels": {"laplacian"},
     "Spreads": {"gbrdf"},
     "SeesTexels": {"gbrdf"},
