@@ -149,8 +149,8 @@ EDITS = (
         "edit: a base class of a method",
         GUEST,
         "btfref/representations/tabulated/svd.py",
-        "return evaluate_tabulated(self,",
-        "return 1.1 * evaluate_tabulated(self,",
+        "return evaluate_tabulated(",
+        "return 1.1 * evaluate_tabulated(",
     ),
     Edit(
         "edit: the generator of hard lookups",

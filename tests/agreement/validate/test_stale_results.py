@@ -8,7 +8,7 @@ import pytest
 from btfref.gates import tolerances
 from btfref.provenance import code
 from btfref.registry import methods
-from btfref.validate.injected.edits import EDITS, GUEST, SETTINGS, VIEW, Edit, copied
+from btfref.validate.injected.edits import EDITS, GUEST, SETTINGS, VIEW, Copy, Edit, copied
 from btfref.validate.matrix import Spec
 from btfref.validate.run import validate
 from btfref.validate.self_test import edit_test
@@ -141,6 +141,13 @@ EDIT = Edit(
     "return self._combine_distinct(",
     "return 1.1 * self._combine_distinct(",
 )
+
+
+def test_the_text_of_every_edit_stands_once(tmp_path):
+    copy = Copy(tmp_path)
+    for edit in (*EDITS, EDIT):
+        with copy.edited(edit):
+            assert (copy.folder / edit.file).read_text("utf-8").count(edit.wrong) == 1, edit.name
 
 
 def test_an_edited_port_is_computed_anew_and_fails(cache):
