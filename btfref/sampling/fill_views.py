@@ -5,6 +5,7 @@ What is made together, in which order and by which process has no influence on a
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
@@ -96,20 +97,27 @@ def fill_views(
                 done(view)
 
 
+#: Shares of the last job, by its attributes: a worker is given the same job with each of its tasks.
+_FOUND: dict[str, Shares] = {}
+
+
 def _shares(job: Job) -> Shares:
-    """What a small copy of a synthesis by surface points meets."""
+    """What a small copy of a synthesis by surface points meets; made once a job and process."""
     from btfref.sampling.surface.budget import shares
 
-    with mitsuba_variant(job.settings.variant):
-        found = shares(
-            job.mesostructure,
-            job.views.vectors,
-            job.lights.vectors,
-            spp=job.settings.samples if job.settings.target_error is None else adaptive.SURFACE_POINTS,
-            max_depth=job.settings.max_depth,
-        )
-        _give_back()
-    return found
+    key = json.dumps(job.attributes, sort_keys=True, default=str)
+    if key not in _FOUND:
+        _FOUND.clear()
+        with mitsuba_variant(job.settings.variant):
+            _FOUND[key] = shares(
+                job.mesostructure,
+                job.views.vectors,
+                job.lights.vectors,
+                spp=job.settings.samples if job.settings.target_error is None else adaptive.SURFACE_POINTS,
+                max_depth=job.settings.max_depth,
+            )
+            _give_back()
+    return _FOUND[key]
 
 
 def _regions(store: BTFStore) -> Iterator[tuple[slice, slice, np.ndarray]]:

@@ -80,3 +80,17 @@ def test_a_small_copy_tells_how_a_surface_differs(llvm):
     dark = np.array([[0.6, 0.0, -0.8]])
     nothing = budget.shares(build("flat"), some, dark, spp=4, max_depth=4)
     assert nothing == Shares(budget.MORE_RAYS, 0.0)
+
+
+def test_a_job_is_copied_once_a_process(monkeypatch, llvm):
+    from btfref.sampling import fill_views
+    from btfref.sampling.synthesis import make_job
+
+    calls = []
+    monkeypatch.setattr(budget, "shares", lambda *_, **__: calls.append(1) or QUIET)
+    monkeypatch.setattr(fill_views, "_FOUND", {})
+    settings = {"texels": 4, "views": "2x4", "lights": "2x4", "spp": 2, "estimator": "surface"}
+    # Workers read the job anew for each task.
+    found = [fill_views._shares(make_job("flat", None, settings | {"spp": spp})) for spp in (2, 2, 4)]
+    assert found == [QUIET] * 3
+    assert len(calls) == 2
