@@ -11,12 +11,14 @@ so that bilinear lookups are continuous across the seam.
 
 from __future__ import annotations
 
+import itertools
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.numerics.powers import FLOOR
+from btfref.numerics.solvers.threads import in_parallel, reproducible
 from btfref.numerics.sphere.parabolic import bilinear_stencil, square_to_hemisphere, texel_centres
 
 if TYPE_CHECKING:
@@ -34,8 +36,16 @@ CLIPPED = 25
 #: Texels a side of a parabolic map: 3.6 degrees at the pole, where the narrowest lobe, cos⁶⁴, is 17 degrees wide.
 SIZE = 64
 
-#: Directions filtered at a time: their products with the cells stay in the cache.
-BLOCK = 64
+#: Texels a side of a tile that is filtered at a time: its products with the cells stay in the cache, and one side of
+#: the sphere is nothing to it.
+TILE = 8
+
+#: What is added to powers of cosines: nothing beside any that counts, but its square is no subnormal number, which
+#: would be slow.
+NOTHING = np.float32(1.5e-19)
+
+#: By how much heights in float32 may be off.
+ROUNDING = 1e-5
 
 #: By how much the variances of what is left of a lobe must differ for two lobes to stand for it: less is rounding.
 UNEQUAL = 1e-3
@@ -79,23 +89,40 @@ def lobe_maps(environment: Environment | Cells, *, size: int = SIZE, slices: int
     w, power = environment.cells()
     lit = power.any(1)
     w, power = w[lit].T.astype(np.float32), power[lit].astype(np.float32)
-    axis = map_directions(size).reshape(-1, 3).astype(np.float32)
-    result = np.zeros((slices, len(axis), 3), np.float32)
-    for first in range(0, len(axis), BLOCK):
-        part = slice(first, first + BLOCK)
-        cosine = np.maximum(axis[part] @ w, 0)
-        # Every second exponent is twice the one before: squares, and one power for each parity. They run down to
-        # numbers that are nothing.
-        with np.errstate(under="ignore"):
-            chain = [cosine, cosine ** np.float32(np.sqrt(2))]
-            for i in range(slices):
-                result[i, part] = chain[i % 2] @ power
-                if i + 2 < slices:
-                    np.multiply(chain[i % 2], chain[i % 2], out=chain[i % 2])
-                    # Subnormal numbers are slow and count for nothing; a product is faster than an assignment by mask.
-                    np.multiply(chain[i % 2], chain[i % 2] >= 1e-18, out=chain[i % 2])
-    result *= ((exponents(slices) + 1) / (2 * np.pi))[:, None, None].astype(np.float32)
+    axis = map_directions(size)
+    result = np.zeros((slices, 2, size, size, 3), np.float32)
+
+    def filtered(tile: tuple[int, slice, slice]) -> None:
+        some = axis[tile].reshape(-1, 3)
+        seen = _in_front(some, w)
+        light = power[seen]
+        # Every second exponent is twice the one before: squares, and one power for each parity.
+        cosine = np.maximum(some.astype(np.float32) @ w[:, seen], 0) + NOTHING
+        chain = [cosine, np.exp(np.float32(np.sqrt(2)) * np.log(cosine)) + NOTHING]
+        for i in range(slices):
+            result[i][tile] = (chain[i % 2] @ light).reshape(result[i][tile].shape)
+            if i + 2 < slices:
+                np.multiply(chain[i % 2], chain[i % 2], out=chain[i % 2])
+                np.add(chain[i % 2], NOTHING, out=chain[i % 2])
+
+    with reproducible():
+        in_parallel(filtered, _tiles(size))
+    result *= ((exponents(slices) + 1) / (2 * np.pi))[:, None, None, None, None].astype(np.float32)
     return result.reshape(2 * slices, size, size, 3)
+
+
+def _tiles(size: int) -> list[tuple[int, slice, slice]]:
+    """Tiles of both maps: map, rows, columns."""
+    parts = [slice(first, min(first + TILE, size)) for first in range(0, size, TILE)]
+    return list(itertools.product(range(2), parts, parts))
+
+
+def _in_front(directions: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Lights that are in front of any of some directions near each other, by number; a few others with them."""
+    centre = directions.mean(0)
+    centre /= np.linalg.norm(centre)
+    beside = np.sqrt(max(1 - (directions @ centre).min() ** 2, 0))
+    return np.flatnonzero(centre.astype(np.float32) @ w > -beside - ROUNDING)
 
 
 def moment_maps(environment: Environment | Cells, edge: float, *, size: int = SIZE) -> np.ndarray:
@@ -125,13 +152,15 @@ def moment_maps(environment: Environment | Cells, edge: float, *, size: int = SI
     square = np.stack([x * x, y * y, z * z, x * y, x * z, y * z], 1)
     features = [(m[:, :, None] * power[:, None]).reshape(len(w), -1) for m in (square, w)] + [power]
     features = [f.astype(np.float32) for f in features]
-    normal = map_directions(size).reshape(-1, 3)
-    result = np.zeros((9, len(normal), 3))
+    lights, normal = w.T.astype(np.float32), map_directions(size)
+    result = np.zeros((9, 2, size, size, 3))
     radius = np.sqrt(max(1 - edge * edge, 0))
-    for first in range(0, len(normal), BLOCK):
-        part = slice(first, first + BLOCK)
-        n = normal[part]
-        height = (n.astype(np.float32) @ w.T.astype(np.float32)).astype(np.float32)
+
+    def filtered(tile: tuple[int, slice, slice]) -> None:
+        n = normal[tile].reshape(-1, 3)
+        seen = _in_front(n, lights)
+        light = [f[seen] for f in features]
+        height = n.astype(np.float32) @ lights[:, seen]
         below = height < edge
         # l' = α l + β n: unchanged above the edge; there the horizontal part grows to the ring's radius.
         horizontal = np.sqrt(np.maximum(1 - height * height, 1e-12))
@@ -139,15 +168,19 @@ def moment_maps(environment: Environment | Cells, edge: float, *, size: int = SI
         b = np.where(below, edge - a * height, 0).astype(np.float32)
         fade = np.where(below, np.maximum(height, 0) / max(edge, 1e-30), 1).astype(np.float32)
         aa, ab, bb = (
-            (fade * k).astype(np.float32) @ f for k, f in zip((a * a, a * b, b * b), features, strict=True)
+            (fade * k).astype(np.float32) @ f for k, f in zip((a * a, a * b, b * b), light, strict=True)
         )
-        va, vb = (fade * a) @ features[1], (fade * b) @ features[2]
+        va, vb = (fade * a) @ light[1], (fade * b) @ light[2]
         aa, ab, va = aa.reshape(-1, 6, 3), ab.reshape(-1, 3, 3), va.reshape(-1, 3, 3)
+        shape = result[0][tile].shape
         for k, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))):
             mixed = ab[:, i] * n[:, j, None] + ab[:, j] * n[:, i, None]
-            result[k, part] = aa[:, k] + mixed + bb * (n[:, i] * n[:, j])[:, None]
+            result[k][tile] = (aa[:, k] + mixed + bb * (n[:, i] * n[:, j])[:, None]).reshape(shape)
         for k in range(3):
-            result[6 + k, part] = va[:, k] + vb * n[:, k, None]
+            result[6 + k][tile] = (va[:, k] + vb * n[:, k, None]).reshape(shape)
+
+    with reproducible():
+        in_parallel(filtered, _tiles(size))
     return result.reshape(18, size, size, 3).astype(np.float32)
 
 
