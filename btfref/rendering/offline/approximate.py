@@ -96,7 +96,7 @@ def approximate(
     # A plain material is evaluated as a representation is.
     rep: Any
     # Asked for hits alone, whatever their materials do.
-    with loaded(scene, parameters, size=size, sampled=False, interpolation="blended") as made:
+    with loaded(scene, parameters, size=size, plain=True) as made:
         shapes = drawn_shapes(made, [mesh.where for mesh in description.meshes])
         for place, surface in enumerate(surfaces(made, grid)):
             for number, (mesh, drawn) in enumerate(zip(description.meshes, shapes, strict=True)):
