@@ -45,9 +45,10 @@ SEAM = 1e-3
 #: displaced surface: interpolated texture coordinates round by 1e-6 of their range, which repeats several times.
 HIT = 1e-5
 
-#: Change of the value within that distance, as a share of the largest value of the picture, that is an edge of the
-#: mesostructure (its silhouettes, borders of its shadows) and no rounding.
-EDGE = 1e-3
+#: Change of a sample within that distance that is an edge of the mesostructure (its silhouettes, borders of its
+#: shadows) and no rounding: it moves its pixel by this share of the value that errors are relative to. That is the
+#: pixel's own, but at least `DARK` of the largest; both as "image.noise_free" has them.
+EDGE, DARK = 1e-3, 1e-3
 
 #: Pixels whose changes are looked at together.
 TOGETHER = 1 << 17
@@ -173,7 +174,7 @@ def _displaced_edges(scene: JitArray, grid: int) -> np.ndarray | bool:
     lights = [light for light in scene.emitters() if is_delta(light)]
     sensor = scene.sensors()[0]
     width, height = (int(k) for k in sensor.film().crop_size())
-    spread, largest = np.zeros((2, width * height))
+    spread, total = np.zeros(width * height), np.zeros((3, width * height))
     context = mi.BSDFContext()
     moves = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1)]
     steps = [HIT * np.array(axis, float) for axis in zip(*moves, strict=True)]
@@ -199,8 +200,9 @@ def _displaced_edges(scene: JitArray, grid: int) -> np.ndarray | bool:
                 values = np.array(value).reshape(3, -1, len(moves))
                 step = np.abs(values[..., 1:] - values[..., :1]).max((0, 2))
                 spread[part] = np.maximum(spread[part], step)
-                largest[part] = np.maximum(largest[part], np.abs(values[..., 0]).max(0))
-    return (spread > EDGE * largest.max(initial=0)).reshape(height, width)
+                total[:, part] += values[..., 0]
+    value = np.abs(total).max(0)
+    return (spread > EDGE * np.maximum(value, DARK * value.max(initial=0))).reshape(height, width)
 
 
 def _part(ndim: int, axis: int, part: slice) -> tuple[slice, ...]:

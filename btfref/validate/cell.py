@@ -214,15 +214,16 @@ def _cell(cache: Cache, spec: Spec, settings: Settings) -> CellResult:
         Picture("8 bits", eight_bits(image.image, display)[None]),
     ]
     parts = [part(*each, display) for each in of_stages]
+    classes = _classes(path, spec, views, shared)
     browser = browser_picture(path, spec.lights, settings, shared)
     in_browser: list[GateResult] = []
     if browser is not None:
         seen = browser.image[counts], reference.image[counts]
         parts.append(part(TITLE, "real time", *seen, display, beside=True))
-        in_browser = browser_gates(browser.image, reference.image, views.classes)
+        in_browser = browser_gates(browser.image, reference.image, classes)
     found = waterfall(chain, counts, display, parts=parts)
     comparison = compare(
-        image.image, reference.image, classes=views.classes, gate=gates, variance=reference.variance
+        image.image, reference.image, classes=classes, gate=gates, variance=reference.variance
     )
     facts = {
         "name": spec.name,
@@ -250,7 +251,23 @@ def _cell(cache: Cache, spec: Spec, settings: Settings) -> CellResult:
         images["browser"] = browser.image
     measured = (*comparison.gates, *in_browser, *found.gates)
     facts["gates"] = [gate.to_dict() for gate in measured]
-    return CellResult(json_safe(facts), images, views.classes, reference.variance, measured)
+    return CellResult(json_safe(facts), images, classes, reference.variance, measured)
+
+
+def _classes(path: Path, spec: Spec, views: Views, shared: Facts) -> np.ndarray:
+    """Pixel classes for the gates: those of all methods, but for one whose values lie on a geometry of its own.
+
+    Under an environment that geometry has no borders of shadows, and its silhouettes blur.
+    """
+    from btfref.registry import method
+    from btfref.scene.pixel_classes import pixel_classes
+    from mitsuba_plugins import ready
+    from mitsuba_plugins.protocol import Displaced
+
+    ready()
+    if spec.lights in ENVIRONMENTS or not isinstance(method(spec.method).evaluator, Displaced):
+        return views.classes
+    return pixel_classes(path, **shared)
 
 
 def _under_deltas(path: Path, spec: Spec, views: Views, settings: Settings, shared: Facts) -> _Chain:
