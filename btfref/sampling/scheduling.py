@@ -6,7 +6,7 @@ import contextlib
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias, TypedDict
+from typing import TYPE_CHECKING, TypeAlias, TypedDict, TypeVar
 
 from btfref.errors import InputError, MissingDependencyError
 from btfref.sampling.fill_views import fill_views
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 #: Tasks per worker: enough that a slow or lost worker costs little, few enough that scenes are not built for nothing.
 TASKS_PER_WORKER = 6
+
+R = TypeVar("R")
 
 #: One task at a time in a process: Mitsuba's threads use all that the worker may use.
 LOCK = threading.Lock()
@@ -255,20 +257,42 @@ def hand_out(
     InputError
         Workers or the scheduler are lost.
     """
+    largest = 0
+    for count, used in results(client, work, pieces, path):
+        largest = max(largest, used)
+        done(count)
+    return largest
+
+
+def results(
+    client: distributed.Client, work: Callable[..., R], pieces: Iterable[tuple[object, ...]], path: Path
+) -> Iterator[R]:
+    """What workers make of their pieces, as it comes; what a lost worker had not finished goes to another.
+
+    Parameters
+    ----------
+    client, work, pieces, path
+        See `hand_out`, for any result.
+
+    Yields
+    ------
+    object
+
+    Raises
+    ------
+    InputError
+        Workers or the scheduler are lost.
+    """
     import distributed
 
     tasks = [client.submit(work, *piece, pure=False, retries=2) for piece in pieces]
-    largest = 0
     with lost_in_one_line(path):
         try:
             for future in distributed.as_completed(tasks):
-                count, used = future.result()
-                largest = max(largest, used)
-                done(count)
+                yield future.result()
         finally:
             with contextlib.suppress(Exception):  # a cluster that is gone cannot be told
                 client.cancel(tasks)
-    return largest
 
 
 @contextlib.contextmanager
