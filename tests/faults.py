@@ -244,6 +244,15 @@ ROWS = [
         ("scheduler",),
     ),
     Row("workers", "no address", "fit svd good.btf.zarr -o out.exr --scheduler nowhere", ("scheduler",)),
+    *(
+        Row("workers", fault, command, words)
+        for fault, command, words in (
+            ("no address", "validate --only svd --no-report --scheduler nowhere", ("scheduler",)),
+            ("in this process", "validate --self-test --scheduler dask", ("--self-test",)),
+            ("no address", "bench fit --btf good.btf.zarr --scheduler nowhere", ("scheduler",)),
+            ("of no plan", "bench offgrid --scheduler dask", ("plans",)),
+        )
+    ),
     # 7
     Row(
         "locks",

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Iterable
+import uuid
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,10 +14,71 @@ from btfref.errors import InputError
 from btfref.provenance import code, versions
 
 if TYPE_CHECKING:
-    from btfref.types import Facts
+    from btfref.types import Facts, PathLike
+
+#: Ending of the file that tells workers what to be like.
+SUFFIX = ".job.partial"
+
+#: Runs that this process has compared itself with.
+_ACCEPTED: dict[str, Facts] = {}
 
 
-def told(roots: Iterable[str], methods: Iterable[str], places: tuple[str, ...] = ()) -> Facts:
+@contextmanager
+def order(
+    folder: PathLike, roots: Sequence[str], methods: Iterable[str], places: Sequence[str] = (), **more: object
+) -> Iterator[Path]:
+    """A file for workers of a run, in the folder that they share.
+
+    Parameters
+    ----------
+    folder : path-like
+    roots, methods, places
+        See `told`.
+    **more
+        JSON-able, for the workers.
+
+    Yields
+    ------
+    pathlib.Path
+    """
+    asked = {"roots": sorted(set(roots)), "methods": sorted(set(methods)), "places": sorted(set(places))}
+    path = Path(folder).resolve() / f"{uuid.uuid4().hex}{SUFFIX}"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({**more, **asked, "told": told(**asked)}), "utf-8")
+    try:
+        yield path
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def accepted(path: PathLike) -> Facts:
+    """The facts of an `order`, if this process runs the code that it tells of.
+
+    Returns
+    -------
+    dict
+        What was given as ``more``, and ``roots``, ``methods``, ``places``, ``told``.
+
+    Raises
+    ------
+    InputError
+        The file is not seen here; or a version or a file is another, or changed since this process began.
+    """
+    path = Path(path)
+    if path.name not in _ACCEPTED:
+        try:
+            facts = json.loads(path.read_text("utf-8"))
+        except OSError:
+            raise InputError(
+                "a worker does not see the folder", file=path.parent, expected="the same path everywhere"
+            ) from None
+        refuse_other_code(facts["told"], told(facts["roots"], facts["methods"], facts["places"]))
+        _ACCEPTED[path.name] = facts
+    refuse_changed_code(_began())
+    return _ACCEPTED[path.name]
+
+
+def told(roots: Iterable[str], methods: Iterable[str], places: Iterable[str] = ()) -> Facts:
     """Versions, and a hash of every file, behind what modules and methods make.
 
     Parameters
@@ -23,7 +87,7 @@ def told(roots: Iterable[str], methods: Iterable[str], places: tuple[str, ...] =
         Modules, such as ``"btfref.validate.cell"``.
     methods : iterable of str
         Keys of the registry.
-    places : tuple of str
+    places : iterable of str
         Further ``"module:object"``; see `btfref.provenance.code.closure`.
 
     Returns
@@ -31,8 +95,7 @@ def told(roots: Iterable[str], methods: Iterable[str], places: tuple[str, ...] =
     dict
         JSON-able: ``versions``, name → version; ``files``, name within its package → SHA-256.
     """
-    roots, methods = sorted(set(roots)), sorted(set(methods))
-    found = [code.closure(root, tuple(methods), places) for root in roots]
+    found = [code.closure(root, tuple(sorted(methods)), tuple(sorted(places))) for root in sorted(roots)]
     named = frozenset(name for one in found for name in one.external)
     return {
         "versions": {**versions(), **code.external_versions(named)},
@@ -40,15 +103,13 @@ def told(roots: Iterable[str], methods: Iterable[str], places: tuple[str, ...] =
     }
 
 
-def refuse_other_code(asked: Facts, own: Facts, *, since: int, name: str = "a worker") -> None:
-    """Refuse to work for who runs other code, or with code that may have changed since it was loaded.
+def refuse_other_code(asked: Facts, own: Facts, *, name: str = "a worker") -> None:
+    """Refuse to work for who runs other code.
 
     Parameters
     ----------
     asked, own : dict
         What `told` gives there and here.
-    since : int
-        When this process began, in nanoseconds since 1970: files that changed later may not be what it runs.
     name : str
         Of this process, for messages.
 
@@ -64,11 +125,17 @@ def refuse_other_code(asked: Facts, own: Facts, *, since: int, name: str = "a wo
                 raise InputError(
                     f"{name} has {what} of its own", field=key, got=_short(here), expected=_short(there)
                 )
-    refuse_changed_code(since, name=name)
 
 
 def refuse_changed_code(since: int, *, name: str = "a worker") -> None:
     """Refuse to go on where code that was read for a digest may not be what this process has loaded.
+
+    Parameters
+    ----------
+    since : int
+        When this process began, in nanoseconds since 1970.
+    name : str
+        Of this process, for messages.
 
     Raises
     ------
@@ -82,6 +149,13 @@ def refuse_changed_code(since: int, *, name: str = "a worker") -> None:
         )
 
 
+def _began() -> int:
+    import importlib
+
+    psutil = importlib.import_module("psutil")  # comes with Dask, as workers do; without types
+    return int(psutil.Process().create_time() * 1e9)
+
+
 def _newest(path: Path) -> int:
     """When a file last changed or came to its name, which a copy that keeps times cannot hide."""
     facts = path.stat()
@@ -90,8 +164,5 @@ def _newest(path: Path) -> int:
 
 def _short(value: object) -> str:
     """A version, or the start of a hash."""
-    return "nothing" if value is None else str(value)[:40] if not _is_hash(value) else str(value)[:12]
-
-
-def _is_hash(value: object) -> bool:
-    return isinstance(value, str) and len(value) == 64
+    text = "nothing" if value is None else str(value)
+    return text[:12] if len(text) == 64 else text[:80]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, TypedDict, TypeVar
@@ -293,6 +294,52 @@ def results(
         finally:
             with contextlib.suppress(Exception):  # a cluster that is gone cannot be told
                 client.cancel(tasks)
+
+
+def one_a_machine(
+    client: distributed.Client, work: Callable[..., R], pieces: Sequence[tuple[object, ...]], path: Path
+) -> Iterator[tuple[int, R]]:
+    """What workers make of their pieces, no two of them on one machine at a time: for what is timed.
+
+    Parameters
+    ----------
+    client, work, pieces, path
+        See `hand_out`, for any result. Where a worker is lost, its piece may come to another one's machine: `work`
+        must wait there for a lock of the machine's.
+
+    Yields
+    ------
+    int, object
+        Number of the piece and what was made of it, as it comes.
+
+    Raises
+    ------
+    InputError
+        Workers or the scheduler are lost.
+    """
+    import distributed
+
+    waiting = deque(enumerate(pieces))
+    running: dict[distributed.Future, tuple[str, int]] = {}
+    with lost_in_one_line(path):
+        try:
+            while waiting or running:
+                client.wait_for_workers(1, timeout=60)
+                for address, facts in client.scheduler_info(n_workers=-1)["workers"].items():
+                    busy = {machine for machine, _ in running.values()}
+                    if waiting and facts["host"] not in busy:
+                        number, piece = waiting.popleft()
+                        task = client.submit(
+                            work, *piece, pure=False, retries=2, workers=[address], allow_other_workers=True
+                        )
+                        running[task] = facts["host"], number
+                if running:
+                    for task in distributed.wait(list(running), return_when="FIRST_COMPLETED").done:
+                        _, number = running.pop(task)
+                        yield number, task.result()
+        finally:
+            with contextlib.suppress(Exception):  # a cluster that is gone cannot be told
+                client.cancel(list(running))
 
 
 @contextlib.contextmanager

@@ -6,10 +6,8 @@ job of a run it compares what it runs with what was asked for, and before each o
 
 from __future__ import annotations
 
-import json
 import os
 import socket
-import uuid
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -18,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from btfref.errors import BtfrefError, InputError
-from btfref.provenance.told import refuse_changed_code, refuse_other_code, told
+from btfref.provenance.told import accepted, order
 from btfref.validate.pool import Job, use_threads
 from btfref.validate.stages.drawn import driver
 
@@ -26,11 +24,15 @@ if TYPE_CHECKING:
     import distributed
 
     from btfref.sampling.scheduling import Means, Scheduler
-    from btfref.types import Facts, PathLike
+    from btfref.types import PathLike
 
-#: Modules that make results of methods, and those that make what methods share.
-OF_METHODS = ("btfref.validate.cell", "btfref.validate.stages.checks")
-OF_MATERIALS = ("btfref.validate.material", "btfref.validate.stages.off_grid")
+#: Modules that make results.
+ROOTS = (
+    "btfref.validate.cell",
+    "btfref.validate.stages.checks",
+    "btfref.validate.material",
+    "btfref.validate.stages.off_grid",
+)
 
 
 class Workers:
@@ -41,12 +43,12 @@ class Workers:
     client : distributed.Client
     means : Means
         Threads of each.
-    order : pathlib.Path
+    path : pathlib.Path
         The file that tells them what to be like, in the folder of results.
     """
 
-    def __init__(self, client: distributed.Client, means: Means, order: Path) -> None:
-        self._client, self._means, self._order = client, means, order
+    def __init__(self, client: distributed.Client, means: Means, path: Path) -> None:
+        self._client, self._means, self._path = client, means, path
         self.size = max(1, len(client.nthreads()))
 
     def each(self, jobs: Sequence[Job]) -> Iterator[tuple[Any, bool]]:
@@ -59,8 +61,8 @@ class Workers:
         """
         from btfref.sampling.scheduling import results
 
-        pieces = [(str(self._order), job, keys(job), self._means["threads"]) for job in jobs]
-        return results(self._client, work, pieces, self._order.parent)
+        pieces = [(str(self._path), job, keys(job), self._means["threads"]) for job in jobs]
+        return results(self._client, work, pieces, self._path.parent)
 
 
 def keys(job: Job) -> list[str]:
@@ -103,30 +105,17 @@ def workers_of(
     MissingDependencyError
         Dask is not installed.
     """
-    from btfref.provenance import __version__
+    from btfref.mesostructure import place
     from btfref.sampling.scheduling import cluster, refuse_other_versions
 
-    name = uuid.uuid4().hex
-    folder = Path(root).resolve()
     with cluster(scheduler, workers, None) as (client, means):
         refuse_other_versions(client)
         if list(_whereabouts()) in map(list, client.run(_whereabouts).values()):
             # Its threads would draw with this thread's OpenGL context.
             raise InputError("workers must be processes of their own", field="scheduler")
-        facts = {
-            "btfref": __version__,
-            "run": name,
-            "driver": driver(),
-            "methods": sorted(set(methods)),
-            "mesostructures": sorted(set(mesostructures)),
-        }
-        order = folder / f"{name}.job.partial"
-        folder.mkdir(parents=True, exist_ok=True)
-        order.write_text(json.dumps({**facts, "told": code_told(facts)}), "utf-8")
-        try:
-            yield Workers(client, means, order)
-        finally:
-            order.unlink(missing_ok=True)
+        places = [place(name) for name in mesostructures]
+        with order(root, ROOTS, methods, places, driver=driver()) as path:
+            yield Workers(client, means, path)
 
 
 def _whereabouts() -> tuple[str, int]:
@@ -134,22 +123,13 @@ def _whereabouts() -> tuple[str, int]:
     return socket.gethostname(), os.getpid()
 
 
-def code_told(order: Facts) -> Facts:
-    """What a process runs of the code that a run needs: see `btfref.provenance.told.told`."""
-    from btfref.mesostructure import place
-
-    places = tuple(place(name) for name in order["mesostructures"])
-    of_methods, shared = told(OF_METHODS, order["methods"]), told(OF_MATERIALS, (), places)
-    return {kind: {**of_methods[kind], **shared[kind]} for kind in ("versions", "files")}
-
-
-def work(order: str, job: Job, wanted: list[str], threads: int | None) -> tuple[Any, bool]:
+def work(path: str, job: Job, wanted: list[str], threads: int | None) -> tuple[Any, bool]:
     """What a worker does: a job, if what it would make is what is wanted.
 
     Parameters
     ----------
-    order : str
-        File of the run.
+    path : str
+        File of the run: see `btfref.provenance.told.order`.
     job : Job
     wanted : list of str
         Keys of its results, as who asks has them.
@@ -169,7 +149,7 @@ def work(order: str, job: Job, wanted: list[str], threads: int | None) -> tuple[
 
     with LOCK:
         # An OpenGL context belongs to a thread, and Dask's threads come and go.
-        return _thread().submit(_job, order, job, wanted, threads).result()
+        return _thread().submit(_job, path, job, wanted, threads).result()
 
 
 @cache
@@ -177,55 +157,26 @@ def _thread() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1)
 
 
-#: Runs that this worker has compared itself with.
-_ACCEPTED: set[str] = set()
-
-
-def _job(order: str, job: Job, wanted: list[str], threads: int) -> tuple[Any, bool]:
+def _job(path: str, job: Job, wanted: list[str], threads: int) -> tuple[Any, bool]:
     from threadpoolctl import threadpool_limits
 
     use_threads(threads)
     with threadpool_limits(threads):
-        _accept(Path(order))
-        refuse_changed_code(_began())
+        facts = accepted(path)
+        if driver() != facts["driver"]:
+            raise InputError(
+                "a worker draws with another OpenGL driver or browser",
+                field="driver",
+                got=driver(),
+                expected=facts["driver"],
+            )
         own = keys(job)
         if own != wanted:
             raise InputError(
                 "a worker would make another result",
-                file=Path(order).parent,
+                file=Path(path).parent,
                 field=job.run.__name__.strip("_"),
                 got=", ".join(own)[:40] or "nothing",
                 expected=f"{', '.join(wanted)[:40] or 'nothing'}: the same scene files",
             )
         return job.run(*job.arguments)
-
-
-def _accept(order: Path) -> None:
-    """Refuse a run that this worker is not like."""
-    if order.name in _ACCEPTED:
-        return
-    try:
-        facts = json.loads(order.read_text("utf-8"))
-    except OSError:
-        raise InputError(
-            "a worker does not see the folder of results",
-            file=order.parent,
-            field="cache",
-            expected="the same path everywhere",
-        ) from None
-    if driver() != facts["driver"]:
-        raise InputError(
-            "a worker draws with another OpenGL driver or browser",
-            field="driver",
-            got=driver(),
-            expected=facts["driver"],
-        )
-    refuse_other_code(facts["told"], code_told(facts), since=_began())
-    _ACCEPTED.add(order.name)
-
-
-def _began() -> int:
-    """When this process began, in nanoseconds since 1970."""
-    import psutil  # comes with Dask
-
-    return int(psutil.Process().create_time() * 1e9)
