@@ -240,7 +240,7 @@ ROWS = [
     Row(
         "workers",
         "a method that needs the whole",
-        "fit gbrdf good.btf.zarr -o out.exr --scheduler dask",
+        "fit neural good.btf.zarr -o out.exr --scheduler dask",
         ("scheduler",),
     ),
     Row("workers", "no address", "fit svd good.btf.zarr -o out.exr --scheduler nowhere", ("scheduler",)),

@@ -165,7 +165,7 @@ def _material(bsdf: JitArray, part: Part, uv: np.ndarray, ndf_size: int) -> dict
     flat = _flat_btf(bsdf, uv, directions(_TEXTURED_DIRECTIONS if textured else _DIRECTIONS))
     surface = SurfaceSamples(flat, HeightField(np.zeros((len(uv), 1), np.float32)))
     labels = np.zeros(len(uv), np.int64)
-    return material_reflectance(surface, labels, 1, size=ndf_size)
+    return material_reflectance(flat, surface, labels, 1, size=ndf_size)
 
 
 def _flat_btf(bsdf: JitArray, uv: np.ndarray, w: DirectionSet) -> SampledBTF:

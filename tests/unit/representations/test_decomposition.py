@@ -191,7 +191,7 @@ def test_texels_alone_explain_their_samples(planted):
     """With the true heights: parameters of each texel reproduce its weighted samples (relative errors)."""
     rep, btf = planted
     surface = reflectance.SurfaceSamples(btf, rep.field)
-    found = reflectance.texel_reflectance(surface)
+    found = reflectance.texel_reflectance(btf, surface)
     errors = []
     for part in surface.blocks():
         samples = surface.read(part, reflectance.TEXEL_NDF, colour=False)
