@@ -27,7 +27,6 @@ def machine() -> Facts:
     except OSError:
         pass  # not Linux: the processor's name has to do
     return {
-        "name": platform.node(),
         "processor": model,
         "cores": os.cpu_count(),
         "system": platform.platform(),

@@ -72,7 +72,11 @@ def accepted(path: PathLike) -> Facts:
             raise InputError(
                 "a worker does not see the folder", file=path.parent, expected="the same path everywhere"
             ) from None
-        refuse_other_code(facts["told"], told(facts["roots"], facts["methods"], facts["places"]))
+        try:
+            own = told(facts["roots"], facts["methods"], facts["places"])
+        except (InputError, ModuleNotFoundError) as error:
+            raise InputError("a worker lacks code", file=path.parent, got=error) from None
+        refuse_other_code(facts["told"], own)
         _ACCEPTED[path.name] = facts
     refuse_changed_code(_began())
     return _ACCEPTED[path.name]

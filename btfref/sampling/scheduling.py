@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, TypedDict, TypeVar
 
 from btfref.errors import InputError, MissingDependencyError
+from btfref.sampling.cluster.tasks import hand_out
 from btfref.sampling.fill_views import fill_views
 from btfref.sampling.memory import default_budget, peak
 from btfref.sampling.store.layout import DRAFT
@@ -228,164 +228,33 @@ def _distribute(
         order.unlink(missing_ok=True)
 
 
-def hand_out(
-    client: distributed.Client,
-    work: Callable[..., tuple[int, int]],
-    pieces: Sequence[tuple[object, ...]],
-    path: Path,
-    done: Callable[[int], None],
-) -> int:
-    """Give workers their pieces and wait for all; what a lost worker had not finished goes to another.
-
-    Parameters
-    ----------
-    client : distributed.Client
-    work : callable
-        Of a module, called with a piece's arguments; tells how much it has made and its largest memory.
-    pieces : list of tuple
-    path : Path
-        What is written, for messages.
-    done : callable
-        Called with what a piece has made.
-
-    Returns
-    -------
-    int
-        Largest memory (bytes) of a worker.
-
-    Raises
-    ------
-    InputError
-        Workers or the scheduler are lost.
-    """
-    largest = 0
-    for count, used in results(client, work, pieces, path):
-        largest = max(largest, used)
-        done(count)
-    return largest
-
-
-def results(
-    client: distributed.Client, work: Callable[..., R], pieces: Iterable[tuple[object, ...]], path: Path
-) -> Iterator[R]:
-    """What workers make of their pieces, as it comes; what a lost worker had not finished goes to another.
-
-    Parameters
-    ----------
-    client, work, pieces, path
-        See `hand_out`, for any result.
-
-    Yields
-    ------
-    object
-
-    Raises
-    ------
-    InputError
-        Workers or the scheduler are lost.
-    """
-    import distributed
-
-    tasks = [client.submit(work, *piece, pure=False, retries=2) for piece in pieces]
-    with lost_in_one_line(path):
-        try:
-            for future in distributed.as_completed(tasks):
-                yield future.result()
-        finally:
-            with contextlib.suppress(Exception):  # a cluster that is gone cannot be told
-                client.cancel(tasks)
-
-
-def one_a_machine(
-    client: distributed.Client, work: Callable[..., R], pieces: Sequence[tuple[object, ...]], path: Path
-) -> Iterator[tuple[int, R]]:
-    """What workers make of their pieces, no two of them on one machine at a time: for what is timed.
-
-    Parameters
-    ----------
-    client, work, pieces, path
-        See `hand_out`, for any result. Where a worker is lost, its piece may come to another one's machine: `work`
-        must wait there for a lock of the machine's.
-
-    Yields
-    ------
-    int, object
-        Number of the piece and what was made of it, as it comes.
-
-    Raises
-    ------
-    InputError
-        Workers or the scheduler are lost.
-    """
-    import distributed
-
-    waiting = deque(enumerate(pieces))
-    running: dict[distributed.Future, tuple[str, int]] = {}
-    with lost_in_one_line(path):
-        try:
-            while waiting or running:
-                client.wait_for_workers(1, timeout=60)
-                for address, facts in client.scheduler_info(n_workers=-1)["workers"].items():
-                    busy = {machine for machine, _ in running.values()}
-                    if waiting and facts["host"] not in busy:
-                        number, piece = waiting.popleft()
-                        task = client.submit(
-                            work, *piece, pure=False, retries=2, workers=[address], allow_other_workers=True
-                        )
-                        running[task] = facts["host"], number
-                if running:
-                    for task in distributed.wait(list(running), return_when="FIRST_COMPLETED").done:
-                        _, number = running.pop(task)
-                        yield number, task.result()
-        finally:
-            with contextlib.suppress(Exception):  # a cluster that is gone cannot be told
-                client.cancel(list(running))
-
-
-@contextlib.contextmanager
-def lost_in_one_line(path: Path) -> Iterator[None]:
-    """InputError for what Dask says when workers or the scheduler are lost.
-
-    Parameters
-    ----------
-    path : Path
-        What is worked on, for messages.
-    """
-    import distributed
-    from distributed.comm.core import CommClosedError
-
-    try:
-        yield
-    except distributed.scheduler.KilledWorker as error:
-        raise InputError(
-            "workers were lost again and again; start the same command again to go on",
-            file=path,
-            got=str(error).partition("\n")[0],
-        ) from None
-    except (distributed.CancelledError, CommClosedError, TimeoutError) as error:
-        raise InputError(
-            "the scheduler is gone; start the same command again to go on",
-            file=path,
-            field="scheduler",
-            got=f"{type(error).__name__} {error}".partition("\n")[0],
-        ) from None
-
-
 def refuse_other_versions(client: distributed.Client) -> None:
     """InputError for a worker of another btfref; those that join later are told by the job's file."""
     from btfref.provenance import __version__
 
-    try:
-        found = client.run(_version)
-    except (AttributeError, ImportError, ModuleNotFoundError) as error:
-        raise InputError(
-            "a worker of another version", field="btfref", got=f"{error}", expected=__version__
-        ) from None
-    for worker, version in found.items():
+    for worker, version in asked_of_all(client, _version).items():
         if version != __version__:
             raise InputError(
                 f"a worker of another version ({worker})", field="btfref", got=version, expected=__version__
             )
+
+
+def asked_of_all(client: distributed.Client, question: Callable[[], R]) -> dict[str, R]:
+    """Answers of all workers to a function of a module, by their addresses.
+
+    Raises
+    ------
+    InputError
+        A worker that has no such function: one of another btfref.
+    """
+    from btfref.provenance import __version__
+
+    try:
+        return client.run(question)
+    except (AttributeError, ImportError) as error:
+        raise InputError(
+            "a worker of another version", field="btfref", got=f"{error}", expected=__version__
+        ) from None
 
 
 def _version() -> str:

@@ -59,7 +59,7 @@ class Workers:
         InputError
             Workers or the scheduler are lost, or a worker that does not see the folder or is another.
         """
-        from btfref.sampling.scheduling import results
+        from btfref.sampling.cluster.tasks import results
 
         pieces = [(str(self._path), job, keys(job), self._means["threads"]) for job in jobs]
         return results(self._client, work, pieces, self._path.parent)
@@ -106,11 +106,11 @@ def workers_of(
         Dask is not installed.
     """
     from btfref.mesostructure import place
-    from btfref.sampling.scheduling import cluster, refuse_other_versions
+    from btfref.sampling.scheduling import asked_of_all, cluster, refuse_other_versions
 
     with cluster(scheduler, workers, None) as (client, means):
         refuse_other_versions(client)
-        if list(_whereabouts()) in map(list, client.run(_whereabouts).values()):
+        if list(_whereabouts()) in map(list, asked_of_all(client, _whereabouts).values()):
             # Its threads would draw with this thread's OpenGL context.
             raise InputError("workers must be processes of their own", field="scheduler")
         places = [place(name) for name in mesostructures]

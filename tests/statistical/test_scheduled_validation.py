@@ -13,7 +13,7 @@ from btfref.bench.metrics import read_records
 from btfref.bench.plan import read_plan
 from btfref.errors import InputError
 from btfref.provenance import told
-from btfref.sampling.scheduling import one_a_machine
+from btfref.sampling.cluster.tasks import one_a_machine
 from btfref.validate import workers
 from btfref.validate.cache import Cache
 from btfref.validate.injected.edits import SETTINGS, VIEW

@@ -8,15 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from btfref.bench.scheduled.tasks import answered, built
+from btfref.bench.scheduled.tasks import answered, built, processors_there
 from btfref.bench.subjects import Built
 from btfref.provenance.told import order
-from btfref.sampling.scheduling import (
-    cluster,
-    one_a_machine,
-    refuse_other_versions,
-    results,
-)
+from btfref.sampling.cluster.tasks import one_a_machine, results
+from btfref.sampling.scheduling import asked_of_all, cluster, refuse_other_versions
 
 if TYPE_CHECKING:
     import distributed
@@ -187,6 +183,7 @@ def builders(
         return
     with cluster(scheduler, workers, None) as (client, means):
         refuse_other_versions(client)
+        asked_of_all(client, processors_there)
         methods = {entry.method for entry in plan.entries if entry.method}
         with order(folder, [built.__module__], methods) as path:
             yield Builders(client, means, path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +22,13 @@ if TYPE_CHECKING:
     from btfref.bench.plan import Entry
     from btfref.sampling import SampledBTF
     from btfref.types import Facts
+
+
+def processors_there() -> int:
+    """Processors that a worker may use."""
+    from btfref.sampling.scheduling import processors
+
+    return processors()
 
 
 def built(
@@ -59,15 +67,16 @@ def built(
     from btfref.sampling import SampledBTF
     from btfref.sampling.scheduling import processors
 
-    count, facts = processors(), machine()
-    with distributed.Lock(f"btfref: times on {facts['name']}"), _accepted(order, count):
+    count, name = processors(), platform.node()
+    with distributed.Lock(f"btfref: times on {name}"), _accepted(order, count):
         there = _loaded(_seen(btf))
         values = SampledBTF(there.values, there.views, there.lights, None, attributes, there.path)
         made, records = measures.timed_builds(
             {entry.name: lambda _: build(entry, values, seed=seed, payload=payload)}, 1
         )
         path = measures.saved(made[entry.name], entry, _seen(folder))
-        return {**records[entry.name], "worker": {**facts, "processors": count}}, str(path)
+        worker = {"name": name, "processors": count, **machine()}
+        return {**records[entry.name], "worker": worker}, str(path)
 
 
 def answered(order: str, name: str, kind: str, file: str, queries: str, out: str, threads: int | None) -> str:

@@ -78,6 +78,13 @@ def test_a_process_that_began_before_its_code_changed_refuses(guest):
         refuse_changed_code(guest.stat().st_ctime_ns - 1)
 
 
+def test_a_worker_without_a_method_says_so(tmp_path):
+    path = tmp_path / "x.job.partial"
+    path.write_text('{"roots": ["btfref.outputs"], "methods": ["elsewhere"], "places": [], "told": {}}')
+    with pytest.raises(InputError, match=r"a worker lacks code; got .*elsewhere"):
+        accepted(path)
+
+
 def test_a_folder_that_is_not_seen_is_named(tmp_path):
     with pytest.raises(InputError, match="a worker does not see the folder"):
         accepted(tmp_path / "x.job.partial")
