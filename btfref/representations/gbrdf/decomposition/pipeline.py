@@ -16,6 +16,7 @@ from btfref.representations.gbrdf.decomposition.materials import cluster_materia
 from btfref.representations.gbrdf.decomposition.normals import fuse, helmholtz_normals
 from btfref.representations.gbrdf.decomposition.pairs import N_PAIRS, ReciprocalPairs, mean_luminance
 from btfref.representations.gbrdf.decomposition.reflectance import (
+    GROUP,
     SurfaceSamples,
     material_reflectance,
     texel_reflectance,
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 SIMILARITIES = ("reciprocity", "correlation")
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(5.0)
+FIT_MEMORY = FitMemory(view=4, rows=6, texels=2 * GROUP, texel=16_000, field=4, scales=("layers", "pairs"))
 
 #: "paper": correlation in windows of 5 × 5 and depth weight 0.2 (section 6). The unit of the paper's smoothness, 0.1,
 #: is not given; in ours 0.1 flattens everything, 0.02 is the best for the correlation.
