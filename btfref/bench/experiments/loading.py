@@ -31,7 +31,7 @@ METHODS = ("raw", "lpca", "laplacian", "rf_lobes")
 SHARES = (1.0, 0.02, 0.1, 0.3, 0.6)
 
 #: Texels along a side, and rounds; of the quick run.
-SIZE, ROUNDS = (64, 5), (16, 2)
+SIZE, ROUNDS = (64, 3), (16, 2)
 
 
 def run(options: Options) -> Facts:
