@@ -1,8 +1,11 @@
 """The same cells and verdicts, and the same benchmark, whoever computes: this process or the workers of a cluster."""
 
 import os
+import shutil
 import signal
 import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -177,6 +180,35 @@ def test_a_worker_that_is_killed_in_a_validation_loses_nothing(tmp_path, plain, 
     assert without_times(found.to_dict()) == without_times(plain.to_dict())
     two.wait_for_workers(2, timeout=60)
     assert set(two.run(os.getpid).values()) != set(before.values())
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("renderers")
+def test_a_worker_of_other_code_is_refused_and_nothing_is_kept(tmp_path, distributed):
+    """A copy of the packages in which one port has another text."""
+    root, copy, cache = Path(__file__).parents[2], tmp_path / "copy", tmp_path / "cache"
+    for package in ("btfref", "mitsuba_plugins", "shaders"):
+        shutil.copytree(root / package, copy / package, ignore=shutil.ignore_patterns("__pycache__"))
+    edited = copy / "mitsuba_plugins" / "lpca.py"
+    edited.write_text(edited.read_text("utf-8") + "# edited\n", "utf-8")
+    command = [sys.executable, "-m", "distributed.cli.dask_worker", "--nthreads", "1", "--no-nanny"]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": copy}
+    environment = os.environ | {"PYTHONPATH": str(copy)}
+    with (
+        distributed.LocalCluster(n_workers=0, dashboard_address="127.0.0.1:0", silence_logs=50) as local,
+        distributed.Client(local) as client,
+    ):
+        worker = subprocess.Popen([*command, local.scheduler_address], env=environment, **quiet)
+        try:
+            client.wait_for_workers(1, timeout=120)
+            with pytest.raises(
+                InputError, match=r"a worker has code of its own; field 'mitsuba_plugins/lpca\.py'"
+            ):
+                validate(SPECS[:1], settings=SETTINGS, cache=cache, scheduler=client)
+        finally:
+            worker.kill()
+            worker.wait()
+    assert list(cache.iterdir()) == []
 
 
 # --- bench
