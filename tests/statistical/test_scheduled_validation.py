@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from oracle import oracle_btf
 
 from btfref.bench import matrix
 from btfref.bench.metrics import read_records
@@ -237,12 +238,19 @@ key = "nearest"
 """
 
 
-@pytest.mark.usefixtures("llvm")
-def test_workers_build_and_answer_as_one_process_does(tmp_path, one):
+@pytest.mark.parametrize("known", [False, pytest.param(True, marks=pytest.mark.long)])
+def test_workers_build_and_answer_as_one_process_does(tmp_path, one, request, monkeypatch, known):
+    """Of a BTF of a user's, and of geometry, where errors off the grid are found as well."""
+    btf = oracle_btf((4, 4), views="1x3", lights="1x3")
+    if known:
+        request.getfixturevalue("llvm")
+        btf = None
+    else:  # to find all code of all methods takes seconds
+        monkeypatch.setattr(told, "told", lambda roots, methods, places: {"versions": {}, "files": {}})
     (tmp_path / "plan.toml").write_text(PLAN)
     plan, found = read_plan(tmp_path / "plan.toml"), []
     for name, scheduler in (("alone", None), ("shared", one)):
-        matrix.run(plan, tmp_path / name, scheduler=scheduler)
+        matrix.run(plan, tmp_path / name, btf=btf, scheduler=scheduler)
         records = read_records(tmp_path / name)[1:]
         found.append(records)
         assert sorted(path.name for path in (tmp_path / name).iterdir()) == [
@@ -250,6 +258,7 @@ def test_workers_build_and_answer_as_one_process_does(tmp_path, one):
             "results.jsonl",
             "values",
         ]
+    assert ("off_grid" in {record["record"] for record in found[0]}) == known
     for alone, shared in zip(*found, strict=True):
         for key in ("record", "entry", "payload", "file_bytes"):
             assert alone.get(key) == shared.get(key)

@@ -2,7 +2,6 @@
 
 import os
 import sys
-import time
 
 import pytest
 
@@ -22,7 +21,8 @@ def guest(tmp_path, monkeypatch):
     (package / "__init__.py").write_text("")
     (package / "method.py").write_text("def fit():\n    return 1\n")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(code, "_BEGAN", time.time_ns())
+    # As if this process had begun when the last of the files came.
+    monkeypatch.setattr(code, "_BEGAN", (package / "method.py").stat().st_mtime_ns)
     code.forget()
     yield package / "method.py"
     sys.modules.pop("toldguest", None)
@@ -30,7 +30,7 @@ def guest(tmp_path, monkeypatch):
 
 
 def test_a_process_accepts_its_own_code(tmp_path, guest, monkeypatch):
-    began = time.time_ns()
+    began = guest.stat().st_ctime_ns
     monkeypatch.setattr("btfref.provenance.told._began", lambda: began)
     with order(tmp_path / "shared", [ROOT], [], [GUEST], more=3) as path:
         assert accepted(path)["more"] == 3
@@ -67,7 +67,7 @@ def test_what_differs_is_named(change, said):
 def test_a_process_that_began_before_its_code_changed_refuses(guest):
     """Its modules may be the old ones, though the files that it reads now are those of who asks."""
     told([ROOT], [], [GUEST])
-    refuse_changed_code(time.time_ns())
+    refuse_changed_code(guest.stat().st_ctime_ns)
     with pytest.raises(InputError, match=r"toldguest/method\.py: a worker began before its code changed"):
         refuse_changed_code(guest.stat().st_ctime_ns - 1)
     # A copy that keeps an old time of change is seen by when it came.
