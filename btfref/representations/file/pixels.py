@@ -89,9 +89,7 @@ def _read_map(
     rows, columns = planes[0].shape
     result = np.zeros(entry["shape"], planes[0].dtype)
     if leading:
-        # A pixel as one thing: channels stay together.
-        pixels = result.view(np.dtype((np.void, result.itemsize * len(planes))))[..., 0]
-        target = np.moveaxis(pixels, leading, range(len(leading)))
+        target = np.moveaxis(_whole_pixels(result), leading, range(len(leading)))
         unit = rows // len(target)
         if unit % block:  # a checksum is of rows of two indices
             target, unit = target[None], rows
@@ -106,15 +104,22 @@ def _read_map(
             refuse_changed(path, name, entry, (first + start) // block, part)
         if target is not None:
             into = target[first // unit]
-            into[...] = lines.view(target.dtype)[..., 0].reshape(into.shape)
+            into[...] = _whole_pixels(lines).reshape(into.shape)
     return _checked(path, name, entry, result, manifest)
 
 
 def _as_map(path: PathLike, name: str, entry: Facts, pixels: np.ndarray, manifest: Facts) -> np.ndarray:
     """A map from its pixels with the axes in the order of the file, checked."""
     leading = entry.get("rows", [])
-    moved = np.moveaxis(pixels, range(len(leading)), leading) if leading else pixels
-    return _checked(path, name, entry, np.ascontiguousarray(moved), manifest)
+    if leading:
+        moved = np.moveaxis(_whole_pixels(pixels), range(len(leading)), leading)
+        pixels = np.ascontiguousarray(moved)[..., None].view(pixels.dtype)
+    return _checked(path, name, entry, np.ascontiguousarray(pixels), manifest)
+
+
+def _whole_pixels(array: np.ndarray) -> np.ndarray:
+    """An array without its last axis: a pixel as one thing, of which copies keep the channels together."""
+    return array.view(np.dtype((np.void, array.itemsize * array.shape[-1])))[..., 0]
 
 
 def _checked(path: PathLike, name: str, entry: Facts, pixels: np.ndarray, manifest: Facts) -> np.ndarray:
