@@ -155,10 +155,8 @@ def _seen_from_above(made: Mesostructure, texels: int) -> SimpleNamespace:
 
 def _material(bsdf: JitArray, part: Part, uv: np.ndarray, ndf_size: int) -> dict[str, np.ndarray]:
     """Parameters of a part's BSDF: those of a flat BTF made of it, a column of texels."""
-    from btfref.representations.gbrdf.decomposition.reflectance import (
-        SurfaceSamples,
-        material_reflectance,
-    )
+    from btfref.representations.gbrdf.decomposition.reflectance import material_reflectance
+    from btfref.representations.gbrdf.decomposition.samples import SurfaceSamples
 
     textured = bool(part.textures)
     uv = uv if textured and len(uv) else np.full((1, 2), 0.5)

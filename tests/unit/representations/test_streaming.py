@@ -10,7 +10,7 @@ from btfref.errors import InputError
 from btfref.registry import method, methods
 from btfref.representations import between
 from btfref.representations.fit_memory import FIT_BASE, least_budget, read_within, stated
-from btfref.representations.gbrdf.decomposition import reflectance
+from btfref.representations.gbrdf.decomposition import samples
 from btfref.sampling import SampledBTF, open_store
 from btfref.sampling.blocks import BTFBlocks, StreamedBTF, texel_values
 
@@ -53,17 +53,17 @@ def test_streamed_fits_are_those_from_memory(btf, path, key):
 
 def test_points_that_are_looked_up_together_change_no_byte(btf, path, monkeypatch):
     """g-BRDFs: few texels at a time from memory; of a store as many as there is room for, or all views are kept."""
-    monkeypatch.setattr(reflectance, "BLOCK", 8)
-    monkeypatch.setattr(reflectance, "GROUP", 16)
+    monkeypatch.setattr(samples, "BLOCK", 8)
+    monkeypatch.setattr(samples, "GROUP", 16)
     few = {"pairs": 8, "layers": 4, "iterations": 2, "ndf_size": 8, "largest": 2}
     expected, read = digest(method("gbrdf").fit(btf, **few)), []
-    step = 12 * 16 * len(btf.lights) * (len(btf.views) + reflectance.PER_VIEW)
+    step = 12 * 16 * len(btf.lights) * (len(btf.views) + samples.PER_VIEW)
     for spare, together in ((0, 16), (step, 32), (1 << 30, 16)):
-        assert reflectance.texels_together(StreamedBTF(path, spare=spare)) == together
+        assert samples.texels_together(StreamedBTF(path, spare=spare)) == together
         source = StreamedBTF(path, spare=spare)
         assert digest(method("gbrdf").fit(source, **few)) == expected
         read.append(source.passes)
-    assert reflectance.texels_together(btf) == 8
+    assert samples.texels_together(btf) == 8
     assert read[0] > read[1] > round(read[2]) == 1
 
 

@@ -15,13 +15,8 @@ from btfref.representations.gbrdf.decomposition import heights as height_stage
 from btfref.representations.gbrdf.decomposition.materials import cluster_materials
 from btfref.representations.gbrdf.decomposition.normals import fuse, helmholtz_normals
 from btfref.representations.gbrdf.decomposition.pairs import N_PAIRS, ReciprocalPairs, mean_luminance
-from btfref.representations.gbrdf.decomposition.reflectance import (
-    GROUP,
-    SurfaceSamples,
-    material_reflectance,
-    texel_reflectance,
-    texels_together,
-)
+from btfref.representations.gbrdf.decomposition.reflectance import material_reflectance, texel_reflectance
+from btfref.representations.gbrdf.decomposition.samples import GROUP, SurfaceSamples, texels_together
 from btfref.representations.lookup import positive_integer
 from btfref.representations.protocol import FitMemory
 
