@@ -240,10 +240,19 @@ ROWS = [
     Row(
         "workers",
         "a method that needs the whole",
-        "fit gbrdf good.btf.zarr -o out.exr --scheduler dask",
+        "fit neural good.btf.zarr -o out.exr --scheduler dask",
         ("scheduler",),
     ),
     Row("workers", "no address", "fit svd good.btf.zarr -o out.exr --scheduler nowhere", ("scheduler",)),
+    *(
+        Row("workers", fault, command, words)
+        for fault, command, words in (
+            ("no address", "validate --only svd --no-report --scheduler nowhere", ("scheduler",)),
+            ("in this process", "validate --self-test --scheduler dask", ("--self-test",)),
+            ("no address", "bench fit --btf good.btf.zarr --scheduler nowhere", ("scheduler",)),
+            ("of no plan", "bench offgrid --scheduler dask", ("plans",)),
+        )
+    ),
     # 7
     Row(
         "locks",

@@ -14,6 +14,7 @@ SUITES = {
     "env": "btfref.bench.experiments.env",
     "factors": "btfref.bench.experiments.factors",
     "gbrdf": "btfref.bench.experiments.gbrdf",
+    "loading": "btfref.bench.experiments.loading",
     "lobes": "btfref.bench.experiments.lobes",
     "lod": "btfref.bench.experiments.lod",
     "gradients": "btfref.bench.optimisation.gradients",

@@ -11,7 +11,9 @@ import json
 import tempfile
 import uuid
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,21 +21,32 @@ import numpy as np
 
 from btfref.bench import measures
 from btfref.bench.data import materials
+from btfref.bench.scheduled.builds import builders, loaded
 from btfref.bench.subjects import build
 from btfref.bench.timing import machine
 from btfref.querying import off_grid
 
 if TYPE_CHECKING:
     from btfref.bench.plan import Entry, Plan
+    from btfref.bench.scheduled.builds import Builders
     from btfref.bench.subjects import Built
     from btfref.sampling import SampledBTF
+    from btfref.sampling.scheduling import Scheduler
     from btfref.types import Facts, PathLike, Progress
 
 
 RESULTS = "results.jsonl"
 
 
-def run(plan: Plan, out: PathLike, *, btf: SampledBTF | None = None, progress: Progress | None = None) -> str:
+def run(
+    plan: Plan,
+    out: PathLike,
+    *,
+    btf: SampledBTF | None = None,
+    scheduler: Scheduler = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> str:
     """Measure what a plan says.
 
     Parameters
@@ -43,6 +56,10 @@ def run(plan: Plan, out: PathLike, *, btf: SampledBTF | None = None, progress: P
         Folder; a second run is added to what it holds.
     btf : SampledBTF, optional
         Instead of the plan's mesostructures.
+    scheduler, workers
+        Who builds and answers: see `btfref.sampling.scheduling.run`; workers must see the folder. Builds are timed on
+        all processors of a worker's machine, one at a time there. All other times are this process's, when no worker
+        is at work. Peers are built here.
     progress : callable, optional
         ``progress(done, total, label)``.
 
@@ -50,6 +67,11 @@ def run(plan: Plan, out: PathLike, *, btf: SampledBTF | None = None, progress: P
     -------
     str
         Number of the run.
+
+    Raises
+    ------
+    InputError
+        A scheduler that cannot be reached, or a worker that does not see the folder, or has other code.
     """
     writer = _Writer(Path(out), plan)
     if {"eval", "render", "sampling"} & set(plan.measures):
@@ -65,8 +87,9 @@ def run(plan: Plan, out: PathLike, *, btf: SampledBTF | None = None, progress: P
     names = data.pop("mesostructures")
     directions = data.pop("directions")
     settings = {**data, "views": directions, "lights": directions, "seed": plan.seed}
-    for name, sampled in materials(btf, names, progress=progress, **settings):
-        _material(plan, name, sampled, writer, progress)
+    with builders(scheduler, workers, plan, writer.folder) as others:
+        for name, sampled in materials(btf, names, progress=progress, **settings):
+            _material(plan, name, sampled, writer, others, progress)
     return writer.run["id"]
 
 
@@ -103,16 +126,26 @@ class _Writer:
         return name
 
     def values(self, array: np.ndarray) -> str:
-        name = f"values/{uuid.uuid4().hex[:12]}.npy"
+        name = self.name_of_values()
         np.save(self.folder / name, np.asarray(array, np.float32))
         return name
+
+    def name_of_values(self) -> str:
+        return f"values/{uuid.uuid4().hex[:12]}.npy"
 
     def _line(self, record: Facts) -> None:
         with (self.folder / RESULTS).open("a") as stream:
             stream.write(json.dumps(record) + "\n")
 
 
-def _material(plan: Plan, name: str, btf: SampledBTF, writer: _Writer, progress: Progress | None) -> None:
+def _material(
+    plan: Plan,
+    name: str,
+    btf: SampledBTF,
+    writer: _Writer,
+    others: Builders | None,
+    progress: Progress | None,
+) -> None:
     rng = np.random.default_rng(plan.seed)
     queries = measures.sample_queries(btf, plan.settings["error_samples"], rng)
     asked = writer.queries(name, queries)
@@ -130,25 +163,36 @@ def _material(plan: Plan, name: str, btf: SampledBTF, writer: _Writer, progress:
 
         return make
 
-    makes = {entry.name: maker(entry) for entry in plan.entries}
-    built, records = measures.timed_builds(
-        makes, plan.rounds["build"], lambda entry: report(f"build {entry}")
-    )
-    with tempfile.TemporaryDirectory() as folder:
-        paths = {}
+    rounds = plan.rounds["build"]
+    with tempfile.TemporaryDirectory(dir=writer.folder if others else None) as folder:
+        files: dict[str, Path] = {}
+        records: dict[str, Facts] = {}
+        built: dict[str, Built] = {}
+        if others is not None:
+            files, records = others.build(plan, btf, folder, lambda entry: report(f"build {entry}"))
+            built = {key: loaded(path, records[key]["payload"]) for key, path in files.items()}
+        makes = {entry.name: maker(entry) for entry in plan.entries if entry.name not in files}
+        here, timed = measures.timed_builds(makes, rounds, lambda entry: report(f"build {entry}"))
+        built, records = {**built, **here}, {**records, **timed}
+        paths: dict[str, Path | None] = {}
         for entry in plan.entries:
-            paths[entry.name] = measures.saved(built[entry.name], entry, folder)
-            path = paths[entry.name]
+            path = files.get(entry.name) or measures.saved(built[entry.name], entry, folder)
+            paths[entry.name] = path
             more = {"file_bytes": path.stat().st_size if path else None}
             writer.add("build", name, entry, {**records[entry.name], **more})
         own = [(entry, path) for entry in plan.entries if (path := paths[entry.name]) is not None]
+        answers = _Answers(plan, name, built, files, writer, others, report)
         if "off_grid" in plan.measures:
-            _off_grid(plan, name, btf, built, writer, report)
+            truth = measures.off_grid_rows(btf, plan)
+            if truth is not None:  # where the geometry is known
+                rows = writer.queries(f"{name}-off-grid", off_grid.packed(truth))
+                answers.add("off_grid", rows, partial(measures.off_grid_answers, truth=truth))
         if "error" in plan.measures:
-            for entry in plan.entries:
-                report(f"error of {entry.name}")
-                found = built[entry.name].evaluate(queries["uv"], queries["w_light"], queries["w_view"])
-                writer.add("error", name, entry, {"queries": asked, "values": writer.values(found)})
+            answers.add(
+                "error",
+                asked,
+                lambda made: made.evaluate(queries["uv"], queries["w_light"], queries["w_view"]),
+            )
         if "eval" in plan.measures:
             for entry in plan.entries:
                 report(f"evaluations of {entry.name}")
@@ -174,22 +218,33 @@ def _material(plan: Plan, name: str, btf: SampledBTF, writer: _Writer, progress:
                         writer.add(kind, name, entry, record)
 
 
-def _off_grid(
-    plan: Plan,
-    name: str,
-    btf: SampledBTF,
-    built: Mapping[str, Built],
-    writer: _Writer,
-    report: Callable[[str], None],
-) -> None:
-    """Answers of every entry at directions that nobody fitted, where the geometry is known."""
-    truth = measures.off_grid_rows(btf, plan)
-    asked = "" if truth is None else writer.queries(f"{name}-off-grid", off_grid.packed(truth))
-    for entry in plan.entries:
-        report(f"{entry.name} off the grid")
-        if truth is not None:
-            answers = measures.off_grid_answers(built[entry.name], truth)
-            writer.add("off_grid", name, entry, {"queries": asked, "values": writer.values(answers)})
+@dataclass(frozen=True)
+class _Answers:
+    """Answers of all entries to the queries of a material, by this process or by workers."""
+
+    plan: Plan
+    material: str
+    built: Mapping[str, Built]
+    files: Mapping[str, Path]
+    writer: _Writer
+    others: Builders | None
+    report: Callable[[str], None]
+
+    def add(self, kind: str, asked: str, answer: Callable[[Built], np.ndarray]) -> None:
+        """Records of a kind: answers to the queries of a file, for entries of this process by ``answer``."""
+        elsewhere = [entry for entry in self.plan.entries if entry.name in self.files]
+        values = {entry.name: self.writer.name_of_values() for entry in elsewhere}
+        if self.others is not None:
+            folder = self.writer.folder
+            outs = [folder / name for name in values.values()]
+            for name in self.others.answer(kind, elsewhere, self.files, folder / asked, outs):
+                self.report(f"{kind} of {name}")
+        for entry in self.plan.entries:
+            if entry.name not in values:
+                self.report(f"{kind} of {entry.name}")
+                values[entry.name] = self.writer.values(answer(self.built[entry.name]))
+            record = {"queries": asked, "values": values[entry.name]}
+            self.writer.add(kind, self.material, entry, record)
 
 
 def _has_cuda() -> bool:

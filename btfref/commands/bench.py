@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING
 
 from btfref.bench import PICTURED, SUITES
 from btfref.bench.plan import SUFFIX, shipped
-from btfref.commands.shared.options import add_data_folder, add_json, add_only, add_overwrite, words
+from btfref.commands.shared.options import (
+    add_data_folder,
+    add_json,
+    add_only,
+    add_overwrite,
+    add_scheduler,
+    words,
+)
 from btfref.commands.shared.printing import Progress, emit, emit_json, table
 from btfref.commands.shared.reading import output_file
 from btfref.errors import InputError
@@ -58,24 +65,36 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--report", metavar="FILE.html", help="a page with the pictures, of suites that have any"
     )
+    add_scheduler(
+        parser,
+        see="whose workers run the same code and see -o FOLDER under the same name (on this machine or a shared file "
+        "system): they build a plan's methods and find their errors; builds are timed on all processors of a worker's "
+        "machine, one at a time there; all other times are measured here when no worker is at work",
+    )
     add_json(parser, "metrics or the raw result")
     add_overwrite(parser)
 
 
 def run(args: Namespace) -> int:
     """Carry the command out."""
+    if args.scheduler is not None and (args.dataset or not _is_plan(args.suite)):
+        raise InputError("workers are for plans", field="--scheduler", got=args.dataset or args.suite)
     if args.suite in READERS:
         return _compare(args) if args.suite == "compare" else _report(args)
     if args.folders:
         raise InputError("folders are for report and compare", field="FOLDER", got=args.folders[0])
-    if args.dataset and not (args.suite in shipped() or args.suite.endswith(SUFFIX)):
+    if args.dataset and not _is_plan(args.suite):
         raise InputError("a data set is for plans", field="--dataset", got=args.suite, expected="methods")
-    if args.suite in shipped() or args.suite.endswith(SUFFIX):
+    if _is_plan(args.suite):
         return _rows(args) if args.dataset else _plan(args)
     if args.suite in SUITES:
         return _suite(args)
     known = ", ".join([*shipped(), *sorted(SUITES), *READERS])
     raise InputError("no such plan or suite", field="WHAT", got=args.suite, expected=known)
+
+
+def _is_plan(word: str) -> bool:
+    return word in shipped() or word.endswith(SUFFIX)
 
 
 def _plan(args: Namespace) -> int:
@@ -91,7 +110,14 @@ def _plan(args: Namespace) -> int:
     plan = read_plan(shipped().get(args.suite, args.suite), quick=args.quick, only=words(args.only))
     with tempfile.TemporaryDirectory() as scratch, Progress() as progress:
         folder = Path(args.output or scratch)
-        number = run_plan(plan, folder, btf=_btf(args), progress=progress)
+        number = run_plan(
+            plan,
+            folder,
+            btf=_btf(args),
+            scheduler=args.scheduler,
+            workers=args.workers,
+            progress=progress,
+        )
         records = [r for r in read_records(folder) if number in (r.get("run"), r.get("id"))]
         found = rows(folder, records)
     if args.json:

@@ -3,6 +3,9 @@
 Every method is fitted to modelled mesostructures and rendered in shipped scenes under shipped lights by both renderers.
 Each cell tells the error of every stage, from the path-traced mesostructure to the 8-bit picture. Results are kept by
 content: what has not changed is not computed again. Methods of installed packages take part like btfref's own.
+
+With --scheduler materials, views and methods are tasks of a Dask cluster: the cells and verdicts of the plain run. Its
+workers share the cache folder. One with other code, versions, drivers or scene files is refused in one line.
 """
 
 from __future__ import annotations
@@ -12,10 +15,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from btfref.commands.shared.options import add_json, add_only, words
+from btfref.commands.shared.options import add_json, add_only, add_scheduler, words
 from btfref.commands.shared.printing import Progress, absent_line, emit, emit_json, number, table
-from btfref.commands.shared.reading import count
-from btfref.errors import WORKERS
+from btfref.errors import InputError
 
 if TYPE_CHECKING:
     from btfref.validate.run import Validation
@@ -39,8 +41,11 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--cache", metavar="FOLDER", help="of results (default: BTFREF_CACHE, else the user's cache)"
     )
-    parser.add_argument(
-        "--workers", type=count(1, WORKERS), metavar="N", help="processes (default: by cores and memory)"
+    add_scheduler(
+        parser,
+        see="whose workers run the same code and see the cache folder under the same name: on this machine, or on a "
+        "shared file system",
+        workers="processes, or workers of the local cluster (default: by cores and memory)",
     )
     parser.add_argument("--no-report", action="store_true", help="numbers only")
     add_json(parser, "the result")
@@ -67,7 +72,14 @@ def run(args: Namespace) -> int:
     )
     settings = QUICK if args.quick else FULL
     with Progress() as progress:
-        result = validate(specs, settings=settings, cache=args.cache, workers=args.workers, progress=progress)
+        result = validate(
+            specs,
+            settings=settings,
+            cache=args.cache,
+            workers=args.workers,
+            scheduler=args.scheduler,
+            progress=progress,
+        )
         report = None
         if not args.no_report:
             from btfref.report.validation import write_validation
@@ -103,6 +115,8 @@ def lines(result: Validation) -> Iterator[str]:
 
 
 def _self_test(args: Namespace) -> int:
+    if args.scheduler is not None:
+        raise InputError("the self-test runs in this process", field="--scheduler", got="beside --self-test")
     from btfref.validate.injected.faults import FAULTS
     from btfref.validate.self_test import Caught, possible, self_test
 

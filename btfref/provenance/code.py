@@ -293,8 +293,13 @@ def code_of(root: str, *methods: str, places: tuple[str, ...] = ()) -> str:
     digest = hashlib.sha256()
     for name, path in sorted((_place(path), path) for path in found.files):
         digest.update(f"{name}\0{_hash_of(path)}\0".encode())
-    digest.update(json.dumps(_versions(found.external), sort_keys=True).encode())
+    digest.update(json.dumps(external_versions(found.external), sort_keys=True).encode())
     return digest.hexdigest()
+
+
+def files_of(found: Closure) -> dict[str, str]:
+    """Names within their packages of a closure's files, and their SHA-256."""
+    return {_place(path): _hash_of(path) for path in found.files}
 
 
 def _place(path: Path) -> str:
@@ -358,7 +363,7 @@ _ALIASES = {
 }
 
 
-def _versions(external: frozenset[str]) -> Facts:
+def external_versions(external: frozenset[str]) -> Facts:
     """Versions of Python, of what btfref names, of LLVM's very library, and of all distributions that are imported."""
     from btfref.platform import choose_llvm
     from btfref.provenance import versions

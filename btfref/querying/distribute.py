@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from btfref.errors import InputError
 from btfref.mesostructure import Mesostructure
-from btfref.sampling.scheduling import TASKS_PER_WORKER, cluster, hand_out, refuse_other_versions
+from btfref.sampling.cluster.tasks import hand_out
+from btfref.sampling.scheduling import TASKS_PER_WORKER, cluster, refuse_other_versions
 from btfref.sampling.store.layout import DRAFT
 
 if TYPE_CHECKING:

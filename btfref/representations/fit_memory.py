@@ -53,12 +53,13 @@ def least_budget(method: Method, store: BTFStore, parameters: Facts | None = Non
     pairs, texels = len(store.views) * len(store.lights), store.texels[0] * store.texels[1]
     states = stated(method)
     given = method.parameters | (parameters or {}) if states.scales or states.tables else {}
-    blocks = float(states.blocks)
+    scale = 1.0
     for name in states.scales:
-        blocks *= max(1.0, _number(given[name]) / _number(method.parameters[name]))
+        scale *= max(1.0, _number(given[name]) / _number(method.parameters[name]))
+    blocks = states.blocks * scale
     tables = math.prod(_number(given[name]) for name in states.tables) if states.tables else 0
     blocks += TABLE_COPIES * 4 * (tables + states.columns) * (3 * pairs + texels)
-    blocks += texels * (states.texel + len(store.views) * states.field)
+    blocks += texels * (states.texel * scale + len(store.views) * states.field)
     wider = np.dtype(store.dtype).itemsize - HALF
     if states.streams:
         together = max(1, min(store.texels[0], states.texels // store.texels[1])) * store.texels[1]

@@ -334,7 +334,8 @@ class FitMemory:
     blocks : int
         Bytes that do not grow with the BTF, for the default parameters.
     scales : tuple of str
-        Parameters that the blocks are in proportion to, where they are larger than by default.
+        Parameters that the blocks, and the bytes of a texel, are in proportion to, where they are larger than by
+        default.
     tables : tuple of str
         Parameters whose product is the number of tables over pairs of directions, each with a weight for all texels.
     view : float

@@ -99,6 +99,11 @@ class StreamedBTF:
     def _shape(self) -> tuple[int, ...]:
         return len(self.views), len(self.lights), *self.texels, 3
 
+    @property
+    def keeps_all(self) -> bool:
+        """Whether there is room for all views, so that they are read once."""
+        return int(np.prod(self._shape, dtype=np.int64)) * self.dtype.itemsize <= self._spare
+
     def claim(self, size: int) -> bool:
         """See :class:`BTFBlocks`."""
         if size > self._spare:

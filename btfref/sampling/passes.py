@@ -159,7 +159,7 @@ class DistributedBTF(StreamedBTF):
         InputError
             Workers or the scheduler are lost, or a worker does not see the store.
         """
-        from btfref.sampling.scheduling import lost_in_one_line
+        from btfref.sampling.cluster.tasks import lost_in_one_line
 
         assert self.path is not None
         threads = max(1, sum(self._client.nthreads().values()))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias, TypedDict
+from typing import TYPE_CHECKING, TypeAlias, TypedDict, TypeVar
 
 from btfref.errors import InputError, MissingDependencyError
+from btfref.sampling.cluster.tasks import hand_out
 from btfref.sampling.fill_views import fill_views
 from btfref.sampling.memory import default_budget, peak
 from btfref.sampling.store.layout import DRAFT
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
 #: Tasks per worker: enough that a slow or lost worker costs little, few enough that scenes are not built for nothing.
 TASKS_PER_WORKER = 6
+
+R = TypeVar("R")
 
 #: One task at a time in a process: Mitsuba's threads use all that the worker may use.
 LOCK = threading.Lock()
@@ -225,96 +228,33 @@ def _distribute(
         order.unlink(missing_ok=True)
 
 
-def hand_out(
-    client: distributed.Client,
-    work: Callable[..., tuple[int, int]],
-    pieces: Sequence[tuple[object, ...]],
-    path: Path,
-    done: Callable[[int], None],
-) -> int:
-    """Give workers their pieces and wait for all; what a lost worker had not finished goes to another.
-
-    Parameters
-    ----------
-    client : distributed.Client
-    work : callable
-        Of a module, called with a piece's arguments; tells how much it has made and its largest memory.
-    pieces : list of tuple
-    path : Path
-        What is written, for messages.
-    done : callable
-        Called with what a piece has made.
-
-    Returns
-    -------
-    int
-        Largest memory (bytes) of a worker.
-
-    Raises
-    ------
-    InputError
-        Workers or the scheduler are lost.
-    """
-    import distributed
-
-    tasks = [client.submit(work, *piece, pure=False, retries=2) for piece in pieces]
-    largest = 0
-    with lost_in_one_line(path):
-        try:
-            for future in distributed.as_completed(tasks):
-                count, used = future.result()
-                largest = max(largest, used)
-                done(count)
-        finally:
-            with contextlib.suppress(Exception):  # a cluster that is gone cannot be told
-                client.cancel(tasks)
-    return largest
-
-
-@contextlib.contextmanager
-def lost_in_one_line(path: Path) -> Iterator[None]:
-    """InputError for what Dask says when workers or the scheduler are lost.
-
-    Parameters
-    ----------
-    path : Path
-        What is worked on, for messages.
-    """
-    import distributed
-    from distributed.comm.core import CommClosedError
-
-    try:
-        yield
-    except distributed.scheduler.KilledWorker as error:
-        raise InputError(
-            "workers were lost again and again; start the same command again to go on",
-            file=path,
-            got=str(error).partition("\n")[0],
-        ) from None
-    except (distributed.CancelledError, CommClosedError, TimeoutError) as error:
-        raise InputError(
-            "the scheduler is gone; start the same command again to go on",
-            file=path,
-            field="scheduler",
-            got=f"{type(error).__name__} {error}".partition("\n")[0],
-        ) from None
-
-
 def refuse_other_versions(client: distributed.Client) -> None:
     """InputError for a worker of another btfref; those that join later are told by the job's file."""
     from btfref.provenance import __version__
 
-    try:
-        found = client.run(_version)
-    except (AttributeError, ImportError, ModuleNotFoundError) as error:
-        raise InputError(
-            "a worker of another version", field="btfref", got=f"{error}", expected=__version__
-        ) from None
-    for worker, version in found.items():
+    for worker, version in asked_of_all(client, _version).items():
         if version != __version__:
             raise InputError(
                 f"a worker of another version ({worker})", field="btfref", got=version, expected=__version__
             )
+
+
+def asked_of_all(client: distributed.Client, question: Callable[[], R]) -> dict[str, R]:
+    """Answers of all workers to a function of a module, by their addresses.
+
+    Raises
+    ------
+    InputError
+        A worker that has no such function: one of another btfref.
+    """
+    from btfref.provenance import __version__
+
+    try:
+        return client.run(question)
+    except (AttributeError, ImportError) as error:
+        raise InputError(
+            "a worker of another version", field="btfref", got=f"{error}", expected=__version__
+        ) from None
 
 
 def _version() -> str:

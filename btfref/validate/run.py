@@ -2,44 +2,34 @@
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from itertools import groupby
-from multiprocessing import active_children, get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from btfref.comparison.comparison import json_safe
 from btfref.errors import BtfrefError, InputError
 from btfref.gates.verdicts import missing_reference
 from btfref.validate.cache import Cache
-from btfref.validate.cell import CellResult, failed_cell, gate_from, make_cell
-from btfref.validate.material import make_material
+from btfref.validate.cell import CellResult, cell_key, failed_cell, gate_from, make_cell
+from btfref.validate.material import make_material, material_key
 from btfref.validate.matrix import FULL, Settings
-from btfref.validate.pictures import make_carrier, make_views
+from btfref.validate.pictures import CARRIER, make_carrier, make_views, views_key
+from btfref.validate.pool import Job, Pool, default_workers, local
 from btfref.validate.stages.browser import demand_browser
 from btfref.validate.stages.checks import make_checks
-from btfref.validate.stages.drawn import code_of, found, recall
-from btfref.validate.stages.fits import make_fit
-from btfref.validate.stages.off_grid import make_truth
+from btfref.validate.stages.drawn import code_of
+from btfref.validate.stages.fits import fit_key, make_fit
+from btfref.validate.stages.off_grid import make_truth, truth_key
 
 if TYPE_CHECKING:
     from btfref.gates.verdicts import GateResult
+    from btfref.sampling.scheduling import Scheduler
     from btfref.types import Facts, PathLike, Progress
     from btfref.validate.matrix import Spec
-
-
-#: Memory that a process needs: a BTF of 64² texels and 81² directions twice over, and its pictures.
-MEMORY_PER_WORKER = 3 << 30
-
-
-#: A function of a process, which also tells whether it computed anything now, and its arguments.
-_Job = tuple[Callable[..., tuple[Any, bool]], tuple[Any, ...]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +97,7 @@ def validate(
     settings: Settings = FULL,
     cache: PathLike | None = None,
     workers: int | None = None,
+    scheduler: Scheduler = None,
     progress: Progress | None = None,
 ) -> Validation:
     """Compute cells of the matrix.
@@ -119,6 +110,9 @@ def validate(
         Folder of results; `btfref.validate.cache.folder` by default.
     workers : int, optional
         Processes; by default one a core as far as memory allows. One runs in this process.
+    scheduler : str or distributed.Client, optional
+        "dask", for so many workers of a local cluster, or a cluster that runs elsewhere, by its address or a client
+        of it. Its workers must see the folder of results under the same name, and run the same code.
     progress : callable, optional
         Called as ``progress(done, total, label)``.
 
@@ -129,9 +123,9 @@ def validate(
     Raises
     ------
     InputError
-        No cells.
+        No cells; a scheduler that cannot be reached, or a worker that does not see the folder, or has other code.
     MissingDependencyError
-        Without Chromium where ``BTFREF_REQUIRE`` names it.
+        Without Chromium where ``BTFREF_REQUIRE`` names it, or Dask where there is a scheduler.
     BtfrefError
         When a process dies.
     """
@@ -142,14 +136,15 @@ def validate(
     specs = sorted(set(specs))
     if not specs:
         raise InputError("nothing to validate", field="cells", got=0)
-    start, root = time.perf_counter(), str(Cache(cache).root)
+    start, root = time.perf_counter(), str(Cache(cache).root.resolve())
     materials = sorted({spec.mesostructure for spec in specs})
     views = sorted({(spec.mesostructure, spec.scene, spec.lights) for spec in specs})
     methods = [list(group) for _, group in groupby(specs, key=lambda s: (s.mesostructure, s.method))]
-    stages: list[list[_Job]] = [
-        [(job, (root, name, settings)) for job in (_material_job, _truth_job) for name in materials],
-        [(_views_job, (root, *view, settings)) for view in views],
-        [(_method_job, (root, group, settings)) for group in methods],
+    shared = ((_material_job, _material_keys), (_truth_job, _truth_keys))
+    stages: list[list[Job]] = [
+        [Job(*job, (root, name, settings)) for job in shared for name in materials],
+        [Job(_views_job, _views_keys, (root, *view, settings)) for view in views],
+        [Job(_method_job, _method_keys, (root, group, settings)) for group in methods],
     ]
     total = sum(len(stage) for stage in stages)
     workers = min(workers or default_workers(), max(len(stage) for stage in stages))
@@ -160,9 +155,16 @@ def validate(
         code_of("btfref.validate.stages.checks", one)
     results, computed, done = [], 0, 0
     report(0, total, "validating")
-    with _pool(workers) as pool:
+    if scheduler is None:
+        opened: AbstractContextManager[Pool] = local(workers)
+    else:
+        from btfref.validate.workers import workers_of
+
+        opened = workers_of(scheduler, workers, root, [spec.method for spec in specs], materials)
+    with opened as pool:
+        workers = pool.size
         for stage in stages:
-            for result, fresh in _each(pool, stage):
+            for result, fresh in pool.each(stage):
                 results.append(result)
                 computed += fresh
                 done += 1
@@ -175,75 +177,6 @@ def validate(
     return Validation(cells, of_methods, settings, time.perf_counter() - start, computed, total, facts)
 
 
-def default_workers() -> int:
-    """Processes that cores and memory allow."""
-    from btfref.sampling.memory import default_budget
-
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(cores, default_budget() // MEMORY_PER_WORKER))
-
-
-class _Here:
-    """The pool of one worker: this process."""
-
-
-@contextmanager
-def _pool(workers: int) -> Iterator[_Here | ProcessPoolExecutor]:
-    if workers == 1:
-        yield _Here()
-        return
-    others = set(active_children())
-    # Spawned: neither Dr.Jit nor a GL driver survives a fork.
-    made = ProcessPoolExecutor(
-        workers, mp_context=get_context("spawn"), initializer=_start_worker, initargs=(found(),)
-    )
-    with made as pool:
-        try:
-            yield pool
-        except BaseException:
-            # Nobody waits for what they are at, whatever ends this process.
-            pool.shutdown(wait=False, cancel_futures=True)
-            for child in set(active_children()) - others:
-                child.terminate()
-            raise
-
-
-def _start_worker(known: Facts) -> None:
-    """About one core a process: threads would only wait for each other. What is known need not be asked again."""
-    recall(known)
-    os.environ["LP_NUM_THREADS"] = "1"
-    from threadpoolctl import threadpool_limits
-
-    threadpool_limits(1)
-    from btfref.errors import MissingDependencyError
-    from btfref.platform import prepare_llvm
-
-    try:
-        prepare_llvm()
-    except MissingDependencyError:
-        return  # the jobs say so
-    import drjit as dr
-
-    # With a single thread Mitsuba waits forever for an OpenEXR file (the sky of a scene of the user's).
-    dr.set_thread_count(2)
-
-
-def _each(pool: _Here | ProcessPoolExecutor, jobs: Sequence[_Job]) -> Iterator[tuple[Any, bool]]:
-    """Results of jobs as they come; ``(result, whether it was computed now)``."""
-    if isinstance(pool, _Here):
-        for job, arguments in jobs:
-            yield job(*arguments)
-        return
-    futures = [pool.submit(job, *arguments) for job, arguments in jobs]
-    try:
-        for future in as_completed(futures):
-            yield future.result()
-    except BrokenProcessPool as error:
-        raise BtfrefError(
-            "a process of the validation died, most likely for want of memory; try --workers 1"
-        ) from error
-
-
 def _material_job(root: PathLike, mesostructure: str, settings: Settings) -> tuple[None, bool]:
     cache = Cache(root)
     make_material(cache, mesostructure, settings)
@@ -251,10 +184,18 @@ def _material_job(root: PathLike, mesostructure: str, settings: Settings) -> tup
     return None, cache.computed > 0
 
 
+def _material_keys(mesostructure: str, settings: Settings) -> list[str]:
+    return [material_key(mesostructure, settings), fit_key(mesostructure, CARRIER, settings)]
+
+
 def _truth_job(root: PathLike, mesostructure: str, settings: Settings) -> tuple[None, bool]:
     cache = Cache(root)
     make_truth(cache, mesostructure, settings)
     return None, cache.computed > 0
+
+
+def _truth_keys(mesostructure: str, settings: Settings) -> list[str]:
+    return [truth_key(mesostructure, settings)]
 
 
 def _views_job(
@@ -267,6 +208,10 @@ def _views_job(
         # Every cell that needs them fails, and says why.
         return None, True
     return None, cache.computed > 0
+
+
+def _views_keys(mesostructure: str, scene: str | Path, lights: str, settings: Settings) -> list[str]:
+    return [views_key(mesostructure, scene, lights, settings)]
 
 
 def _method_job(root: PathLike, specs: Sequence[Spec], settings: Settings) -> tuple[Facts, bool]:
@@ -282,6 +227,14 @@ def _method_job(root: PathLike, specs: Sequence[Spec], settings: Settings) -> tu
         checks = {"gates": gates, "off_grid": None, "notes": str(error)}
         cells = [failed_cell(spec, str(error)) for spec in specs]
     return {**facts, **json_safe(checks), "cells": cells}, cache.computed > 0
+
+
+def _method_keys(specs: Sequence[Spec], settings: Settings) -> list[str]:
+    first = specs[0]
+    return [
+        fit_key(first.mesostructure, first.method, settings),
+        *(cell_key(spec, settings) for spec in specs),
+    ]
 
 
 __all__ = ["CellResult", "Validation", "default_workers", "method_name", "validate"]

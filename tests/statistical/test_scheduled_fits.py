@@ -24,7 +24,7 @@ pytestmark = [pytest.mark.usefixtures("llvm"), pytest.mark.filterwarnings("defau
 KEYS = ("svd", "lpca", "laplacian", "lafortune")
 
 #: Likewise, of which the default set has enough.
-SLOW = ("rf_poly", "rf_lobes", "lafortune_lut", "cmf", "hf")
+SLOW = ("rf_poly", "rf_lobes", "lafortune_lut", "cmf", "hf", "gbrdf")
 
 
 @pytest.fixture(scope="module")

@@ -40,19 +40,19 @@ def add_tracing(parser: _ActionsContainer, variant: str) -> None:
     parser.add_argument("--variant", default=variant, help="of Mitsuba (default %(default)s; cuda_ad_rgb)")
 
 
-def add_scheduler(parser: _ActionsContainer) -> None:
+def add_scheduler(
+    parser: _ActionsContainer,
+    *,
+    see: str = "whose workers see the same files",
+    workers: str = "of the local cluster (default: one per two processors)",
+) -> None:
     """Who works: ``--scheduler``, ``--workers``."""
     parser.add_argument(
         "--scheduler",
         metavar="dask|ADDRESS",
-        help="workers of a local Dask cluster, or of the one at tcp://HOST:PORT, whose workers see the same files",
+        help=f"workers of a local Dask cluster, or of the one at tcp://HOST:PORT, {see}",
     )
-    parser.add_argument(
-        "--workers",
-        type=count(1, WORKERS),
-        metavar="N",
-        help="of the local cluster (default: one per two processors)",
-    )
+    parser.add_argument("--workers", type=count(1, WORKERS), metavar="N", help=workers)
 
 
 def add_overwrite(parser: _ActionsContainer) -> None:

@@ -18,6 +18,12 @@ if TYPE_CHECKING:
     from btfref.representations.file.rows import RowReader
     from btfref.types import Facts, PathLike
 
+#: Values that are looked through at a time.
+_PART = 1 << 18
+
+#: Bits of a half float without its sign, and what they are of an infinite one; of NaN they are more.
+_SIZE, _INFINITE = np.uint16(0x7FFF), np.uint16(0x7C00)
+
 
 def _planes_of(path: PathLike, name: str, entry: Facts, part: Any) -> list[np.ndarray]:
     """Channels of a part in the order of the map's, each (rows, columns)."""
@@ -74,23 +80,53 @@ def rows_read(
 def _read_map(
     path: PathLike, name: str, entry: Facts, planes: list[np.ndarray], manifest: Facts
 ) -> np.ndarray:
-    """A map from the channels of its image, checked."""
-    block = block_of(entry)
-    image = np.zeros((*planes[0].shape, len(planes)), planes[0].dtype)
-    for number, first in enumerate(range(0, len(image), block)):
-        lines = image[first : first + block]
-        for i, plane in enumerate(planes):
-            lines[..., i] = plane[first : first + block]
-        refuse_changed(path, name, entry, number, lines)
-    return _as_map(path, name, entry, image.reshape(file_shape(entry)), manifest)
+    """A map from the channels of its image, checked.
+
+    The order of its axes in memory is made while parts of the image are in the processor's caches: those of one index
+    of the first axis of the file.
+    """
+    block, leading = block_of(entry), entry.get("rows", [])
+    rows, columns = planes[0].shape
+    result = np.zeros(entry["shape"], planes[0].dtype)
+    if leading:
+        target = np.moveaxis(_whole_pixels(result), leading, range(len(leading)))
+        unit = rows // len(target)
+        if unit % block:  # a checksum is of rows of two indices
+            target, unit = target[None], rows
+        lines = np.zeros((unit, columns, len(planes)), result.dtype)
+    else:
+        target, unit, lines = None, rows, result.reshape(rows, columns, len(planes))
+    for first in range(0, rows, unit):
+        for start in range(0, unit, block):
+            part = lines[start : start + block]
+            for i, plane in enumerate(planes):
+                part[..., i] = plane[first + start : first + start + len(part)]
+            refuse_changed(path, name, entry, (first + start) // block, part)
+        if target is not None:
+            into = target[first // unit]
+            into[...] = _whole_pixels(lines).reshape(into.shape)
+    return _checked(path, name, entry, result, manifest)
 
 
 def _as_map(path: PathLike, name: str, entry: Facts, pixels: np.ndarray, manifest: Facts) -> np.ndarray:
     """A map from its pixels with the axes in the order of the file, checked."""
+    leading = entry.get("rows", [])
+    if leading:
+        moved = np.moveaxis(_whole_pixels(pixels), range(len(leading)), leading)
+        pixels = np.ascontiguousarray(moved)[..., None].view(pixels.dtype)
+    return _checked(path, name, entry, np.ascontiguousarray(pixels), manifest)
+
+
+def _whole_pixels(array: np.ndarray) -> np.ndarray:
+    """An array without its last axis: a pixel as one thing, of which copies keep the channels together."""
+    return array.view(np.dtype((np.void, array.itemsize * array.shape[-1])))[..., 0]
+
+
+def _checked(path: PathLike, name: str, entry: Facts, pixels: np.ndarray, manifest: Facts) -> np.ndarray:
+    """A map from its pixels, of which none is what no map holds."""
     # What a partial table lacks stands in it as NaN, and gives NaN where it is asked for.
     partly = manifest["meta"].get("partial", False) and not name.startswith(("view_", "light_"))
-    broken = np.isinf if partly else lambda values: ~np.isfinite(values)
-    if pixels.dtype.kind == "f" and broken(pixels).any():
+    if pixels.dtype.kind == "f" and not _finite(pixels, or_nan=partly):
         raise InputError("a map holds a value that is not finite", file=path, field=name)
     if entry["dtype"] == "uint8":
         if ((pixels < 0) | (pixels > 1)).any():
@@ -98,5 +134,20 @@ def _as_map(path: PathLike, name: str, entry: Facts, pixels: np.ndarray, manifes
                 "an 8-bit map holds a value out of range", file=path, field=name, expected="[0, 1]"
             )
         pixels = np.rint(pixels.astype(np.float32) * 255).astype(np.uint8)
-    leading = entry.get("rows", [])
-    return np.ascontiguousarray(np.moveaxis(pixels, range(len(leading)), leading)) if leading else pixels
+    return pixels
+
+
+def _finite(pixels: np.ndarray, *, or_nan: bool) -> bool:
+    """Whether all values are finite, or NaN where that may be; looked through in parts that fit the caches."""
+    flat = pixels.reshape(-1)
+    for first in range(0, flat.size, _PART):
+        part = flat[first : first + _PART]
+        if part.dtype != np.float16:
+            good = ~np.isinf(part) if or_nan else np.isfinite(part)
+        else:
+            # NumPy converts halves one by one to look at them; their bits tell as well.
+            size = part.view(np.uint16) & _SIZE
+            good = size != _INFINITE if or_nan else size < _INFINITE
+        if not good.all():
+            return False
+    return True

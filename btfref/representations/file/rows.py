@@ -173,8 +173,8 @@ class RowReader:
             pixels = [self._chunk(name, table, chunk, place) for chunk in chunks]
             lines = pixels[0] if len(pixels) == 1 else np.concatenate(pixels)
             inside = wanted[start:stop] - first
-            for k in np.unique(inside // block):
-                check(first // block + int(k), lines[k * block : (k + 1) * block])
+            for k in sorted(set((inside // block).tolist())):
+                check(first // block + k, lines[k * block : (k + 1) * block])
             result[start:stop] = lines if len(inside) == len(lines) else lines[inside]
         return result
 
@@ -193,7 +193,10 @@ class RowReader:
         data = np.frombuffer(stored, np.uint8) if whole else self._inflated(stored, count * line)
         # Of each line one channel after the other.
         pixels = data.view(part.kind).reshape(count, len(place), part.columns)
-        return np.ascontiguousarray(np.moveaxis(pixels[:, place], 1, -1))
+        result = np.zeros((count, part.columns, len(place)), part.kind)
+        for i, channel in enumerate(place):
+            result[..., i] = pixels[:, channel]
+        return result
 
     def _inflated(self, data: bytes, size: int) -> np.ndarray:
         try:

@@ -155,17 +155,15 @@ def _seen_from_above(made: Mesostructure, texels: int) -> SimpleNamespace:
 
 def _material(bsdf: JitArray, part: Part, uv: np.ndarray, ndf_size: int) -> dict[str, np.ndarray]:
     """Parameters of a part's BSDF: those of a flat BTF made of it, a column of texels."""
-    from btfref.representations.gbrdf.decomposition.reflectance import (
-        SurfaceSamples,
-        material_reflectance,
-    )
+    from btfref.representations.gbrdf.decomposition.reflectance import material_reflectance
+    from btfref.representations.gbrdf.decomposition.samples import SurfaceSamples
 
     textured = bool(part.textures)
     uv = uv if textured and len(uv) else np.full((1, 2), 0.5)
     flat = _flat_btf(bsdf, uv, directions(_TEXTURED_DIRECTIONS if textured else _DIRECTIONS))
     surface = SurfaceSamples(flat, HeightField(np.zeros((len(uv), 1), np.float32)))
     labels = np.zeros(len(uv), np.int64)
-    return material_reflectance(surface, labels, 1, size=ndf_size)
+    return material_reflectance(flat, surface, labels, 1, size=ndf_size)
 
 
 def _flat_btf(bsdf: JitArray, uv: np.ndarray, w: DirectionSet) -> SampledBTF:

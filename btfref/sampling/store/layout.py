@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from btfref.numerics.sphere.directions import DirectionSet
     from btfref.types import Facts, PathLike
 
-#: Texels along one side of an inner chunk.
+#: Texels along one side of an inner chunk at most: see `side_of`.
 TILE = 64
 
 #: Bytes (as 32-bit floats) that a shard holds at most, unless a single chunk is larger: what must be in memory
@@ -151,6 +151,25 @@ def shard_shape(n_lights: int, texels: tuple[int, int], tile: tuple[int, int]) -
     return lights, rows, columns
 
 
+def side_of(texels: int, most: int) -> int:
+    """Texels along one side of a chunk, for so many in all: as many chunks as there must be, as alike as they can be.
+
+    A chunk is stored whole, also where it reaches beyond the last texel: 400 texels in chunks of 64 take the place of
+    448, in chunks of 58 that of 406.
+
+    Parameters
+    ----------
+    texels : int
+    most : int
+        Of a chunk.
+
+    Returns
+    -------
+    int
+    """
+    return -(-texels // -(-texels // most))
+
+
 def write_headers(
     path: PathLike,
     views: DirectionSet,
@@ -170,7 +189,7 @@ def write_headers(
 
     rows, columns = texels
     n_views, n_lights = len(views), len(lights)
-    tile_rows, tile_columns = min(tile, rows), min(tile, columns)
+    tile_rows, tile_columns = side_of(rows, tile), side_of(columns, tile)
     n_tiles = -(-rows // tile_rows), -(-columns // tile_columns)
     shard = shard_shape(n_lights, texels, (tile_rows, tile_columns))
     conventions = {"schema_version": SCHEMA_VERSION, **CONVENTIONS}

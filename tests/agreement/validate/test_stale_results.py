@@ -131,7 +131,12 @@ def test_several_processes_count_what_they_compute(cache):
 
 #: Modules that make results, and those that only call them.
 STAGES = ("material", "stages.fits", "pictures", "cell", "stages.checks", "stages.off_grid")
-CALLERS = {"btfref.validate.run", "btfref.validate.injected", "btfref.validate.injected.edits"}
+CALLERS = {
+    "btfref.validate.run",
+    "btfref.validate.pool",
+    "btfref.validate.injected",
+    "btfref.validate.injected.edits",
+}
 
 #: A factor in a port that renders and probes see, and no fit.
 EDIT = Edit(

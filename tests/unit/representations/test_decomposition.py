@@ -11,7 +11,7 @@ from btfref.numerics.microfacets import isotropic_ndf
 from btfref.numerics.sphere.directions import directions
 from btfref.numerics.sphere.parabolic import texel_directions
 from btfref.representations.gbrdf.build import from_maps
-from btfref.representations.gbrdf.decomposition import heights, materials, normals, reflectance
+from btfref.representations.gbrdf.decomposition import heights, materials, normals, reflectance, samples
 from btfref.representations.gbrdf.decomposition.pairs import (
     ReciprocalPairs,
     shifted,
@@ -190,15 +190,15 @@ def test_distributions_are_limited(rng):
 def test_texels_alone_explain_their_samples(planted):
     """With the true heights: parameters of each texel reproduce its weighted samples (relative errors)."""
     rep, btf = planted
-    surface = reflectance.SurfaceSamples(btf, rep.field)
-    found = reflectance.texel_reflectance(surface)
+    surface = samples.SurfaceSamples(btf, rep.field)
+    found = reflectance.texel_reflectance(btf, surface)
     errors = []
-    for part in surface.blocks():
-        samples = surface.read(part, reflectance.TEXEL_NDF, colour=False)
-        p = found["ndf"][part].ravel()[samples.place]
-        shape = found["specular"][part] * p * samples.fresnel(found["fresnel"][part]) * samples.factor
-        model = found["diffuse"][part] * samples.light + shape
-        errors.append((samples.values[0] - model)[samples.light > 0])
+    (group,) = surface.groups(surface.n_texels)
+    for part, seen in surface.each(btf, group, reflectance.TEXEL_NDF, colour=False):
+        p = found["ndf"][part].ravel()[seen.place]
+        shape = found["specular"][part] * p * seen.fresnel(found["fresnel"][part]) * seen.factor
+        model = found["diffuse"][part] * seen.light + shape
+        errors.append((seen.values[0] - model)[seen.light > 0])
     error = np.abs(np.concatenate(errors))
     assert np.median(error) <= tolerance("decomposition.samples.median")
     assert (found["diffuse"] <= 1).all()

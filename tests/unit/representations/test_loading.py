@@ -8,7 +8,7 @@ import pytest
 from btfref.gates.tolerances import tolerance
 from btfref.numerics.sphere.directions import directions
 from btfref.registry import method
-from btfref.representations.file import container
+from btfref.representations.file import container, pixels
 from btfref.representations.file.container import bytes_of_choice, load, save
 from btfref.representations.file.resident import keeping
 from btfref.representations.lookup import direction_arrays, meta_for
@@ -82,6 +82,32 @@ def test_bytes_and_memory_follow_what_is_asked_for(made):
     views = keeping(whole, views=VIEWS) if whole.meta["method"] == "lpca" else expected
     assert read <= tolerance("loading.share") * kept_alone(views) + tolerance("loading.constant")
     assert peak <= tolerance("loading.copies") * kept_alone(views) + tolerance("loading.constant")
+
+
+def test_the_whole_comes_back_whatever_the_order_of_its_axes_in_the_file(made):
+    whole, path, _ = made
+    for name, array in load(path).arrays().items():
+        np.testing.assert_array_equal(array, whole.arrays()[name])
+        assert array.flags.c_contiguous
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32"])
+@pytest.mark.parametrize(
+    ("value", "finite", "or_nan"),
+    [
+        (65504, True, True),
+        (-1e-7, True, True),
+        (np.nan, False, True),
+        (np.inf, False, False),
+        (-np.inf, False, False),
+    ],
+)
+def test_values_that_are_not_finite_are_seen(monkeypatch, dtype, value, finite, or_nan):
+    monkeypatch.setattr(pixels, "_PART", 4)
+    array = np.zeros((3, 3), dtype)
+    array[1, 2] = value
+    assert pixels._finite(array, or_nan=False) is finite
+    assert pixels._finite(array, or_nan=True) is or_nan
 
 
 def test_files_of_blocks_are_read_as_before(made, tmp_path, monkeypatch):

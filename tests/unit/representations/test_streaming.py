@@ -10,6 +10,7 @@ from btfref.errors import InputError
 from btfref.registry import method, methods
 from btfref.representations import between
 from btfref.representations.fit_memory import FIT_BASE, least_budget, read_within, stated
+from btfref.representations.gbrdf.decomposition import samples
 from btfref.sampling import SampledBTF, open_store
 from btfref.sampling.blocks import BTFBlocks, StreamedBTF, texel_values
 
@@ -50,6 +51,22 @@ def test_streamed_fits_are_those_from_memory(btf, path, key):
         assert round(source.passes, 6) >= 1
 
 
+def test_points_that_are_looked_up_together_change_no_byte(btf, path, monkeypatch):
+    """g-BRDFs: few texels at a time from memory; of a store as many as there is room for, or all views are kept."""
+    monkeypatch.setattr(samples, "BLOCK", 8)
+    monkeypatch.setattr(samples, "GROUP", 16)
+    few = {"pairs": 8, "layers": 4, "iterations": 2, "ndf_size": 8, "largest": 2}
+    expected, read = digest(method("gbrdf").fit(btf, **few)), []
+    step = 12 * 16 * len(btf.lights) * (len(btf.views) + samples.PER_VIEW)
+    for spare, together in ((0, 16), (step, 32), (1 << 30, 16)):
+        assert samples.texels_together(StreamedBTF(path, spare=spare)) == together
+        source = StreamedBTF(path, spare=spare)
+        assert digest(method("gbrdf").fit(source, **few)) == expected
+        read.append(source.passes)
+    assert samples.texels_together(btf) == 8
+    assert read[0] > read[1] > round(read[2]) == 1
+
+
 def test_memory_to_spare_saves_passes(path):
     read = []
     for spare in (0, 1 << 30):
@@ -80,7 +97,7 @@ def test_views_rows_and_texels_are_the_values(btf, path):
 
 def test_what_does_not_stream_is_read_whole(path):
     store = open_store(path)
-    assert isinstance(read_within(method("gbrdf"), store, None), SampledBTF)
+    assert isinstance(read_within(method("neural"), store, None), SampledBTF)
     assert isinstance(read_within(method("svd"), store, None), StreamedBTF)
     with pytest.raises(InputError, match="memory budget too small to fit svd"):
         read_within(method("svd"), store, FIT_BASE)
@@ -90,7 +107,7 @@ def test_a_large_btf_needs_little_of_its_size(path):
     """At 400² texels and 151² directions, 21.9 GB of half floats."""
     store = open_store(path)
     store.texels, store.views, store.lights = (400, 400), [None] * 151, [None] * 151
-    for key in ("svd", "lpca", "laplacian"):
+    for key in ("svd", "lpca", "laplacian", "gbrdf"):
         assert least_budget(method(key), store) < 6 << 30
 
 

@@ -10,7 +10,7 @@ import pytest
 from btfref.errors import InputError
 from btfref.numerics.sphere.directions import directions
 from btfref.sampling import SampledBTF, open_store
-from btfref.sampling.store.layout import remove_leftovers
+from btfref.sampling.store.layout import TILE, remove_leftovers, side_of
 from btfref.sampling.store.store import BTFStore, create_store
 
 VIEWS, LIGHTS = directions("2x3"), directions("2x4")
@@ -26,6 +26,45 @@ def _btf(rng, dtype="float16", rows=6, columns=10, variance=True):
         "versions": {"btfref": "0"},
     }
     return SampledBTF(values, VIEWS, LIGHTS, spread, attributes)
+
+
+@pytest.mark.parametrize(
+    ("texels", "side", "padded"),
+    [(400, 58, 406), (256, 64, 256), (64, 64, 64), (65, 33, 66), (100, 50, 100), (7, 7, 7), (129, 43, 129)],
+)
+def test_chunks_are_as_alike_as_they_can_be(texels, side, padded):
+    assert side_of(texels, TILE) == side <= TILE
+    count = -(-texels // side)
+    # No more chunks than those of the largest size would be, and less beyond the last texel than a row a chunk.
+    assert count == -(-texels // TILE)
+    assert side * count == padded < texels + count
+
+
+def test_a_store_is_little_larger_than_its_values(tmp_path, rng):
+    btf = _btf(rng, rows=10, columns=5, variance=False)
+    sizes = []
+    for name, most in (("alike", 8), ("whole", 50)):
+        btf.save(tmp_path / name, tile=most)
+        assert open_store(tmp_path / name).tile == (5 if most == 8 else 10, 5)
+        files = (tmp_path / name / "values" / "c").rglob("*")
+        sizes.append(sum(path.stat().st_size for path in files if path.is_file()))
+        np.testing.assert_array_equal(SampledBTF.load(tmp_path / name).values, btf.values)
+    # A checksum and a place more for each chunk.
+    assert sizes[0] - sizes[1] == len(VIEWS) * len(LIGHTS) * 20
+
+
+def test_stores_of_earlier_versions_are_read_and_finished(tmp_path, rng, monkeypatch):
+    """Their chunks were of the largest size, the last ones partly beyond the texels."""
+    btf, path = _btf(rng, rows=10, columns=5, variance=False), tmp_path / "a.btf.zarr"
+    with monkeypatch.context() as patch:
+        patch.setattr("btfref.sampling.store.layout.side_of", min)
+        store = create_store(path, views=VIEWS, lights=LIGHTS, texels=(10, 5), variance=False, tile=8)
+        store.write_view(0, btf.values[0])
+    store = open_store(path)
+    assert store.tile == (8, 5)
+    for view in range(1, len(VIEWS)):
+        store.write_view(view, btf.values[view])
+    np.testing.assert_array_equal(SampledBTF.load(path).values, btf.values)
 
 
 @pytest.mark.parametrize("dtype", ["float16", "float32"])
@@ -103,7 +142,7 @@ def _counting(path):
         ({"views": 1}, 1, None),
         ({"lights": 3}, 6, 6 * 6),
         ({"views": 2, "lights": 5}, 1, 6),
-        ({"rows": slice(0, 4), "columns": slice(4, 8)}, 6, 6 * 8),
+        ({"rows": slice(0, 3), "columns": slice(4, 8)}, 6, 6 * 8),
         ({"views": 0, "lights": 0, "rows": 5, "columns": 9}, 1, 1),
     ],
 )
@@ -117,7 +156,7 @@ def test_parts_touch_only_their_chunks(tmp_path, rng, part, files, chunks):
     reads = [(key, size) for key, size in log if key.startswith("values/c/")]
     assert len({key for key, _ in reads}) == files
     assert not any(key.startswith("variance/") for key, _ in log)
-    chunk = 4 * 4 * 3 * 2 + 4
+    chunk = 3 * 4 * 3 * 2 + 4
     if chunks is not None:
         # An index is read of each file (16 bytes a chunk and a checksum), then the chunks alone.
         index = 16 * 8 * 6 + 4

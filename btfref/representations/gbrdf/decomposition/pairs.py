@@ -5,16 +5,21 @@ Source: Menzel and Guthe 2009, eq. 3 and 4: ``L(k1, k2) = ρ(k1, k2) (k1·n) L_i
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from btfref.conventions import LUMINANCE
+from btfref.representations.lookup import refuse_not_finite
+from btfref.sampling.passes import over_blocks
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import ArrayLike
 
-    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.blocks import BTFBlocks
 
 
 #: Directions further from the normal take no part: their images are foreshortened to little more than silhouettes.
@@ -28,11 +33,11 @@ BLACK = 0.01
 
 
 class ReciprocalPairs:
-    """Luminance images of a BTF for pairs of directions.
+    """Luminance images of a BTF for pairs of directions, all of them made in one pass over the views.
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
         Lights that differ from the views are interpolated by their own stencil.
     count : int
         At most so many pairs, drawn with ``seed``.
@@ -46,10 +51,15 @@ class ReciprocalPairs:
         Rows and columns of an image.
     black : float
         Luminance in 1/sr that :meth:`logarithms` holds.
+
+    Raises
+    ------
+    InputError
+        For values that are not finite.
     """
 
-    def __init__(self, btf: SampledBTF, count: int = N_PAIRS, seed: int = 0) -> None:
-        self._btf, self.shape = btf, btf.texels
+    def __init__(self, btf: BTFBlocks, count: int = N_PAIRS, seed: int = 0) -> None:
+        self.shape = btf.texels
         views = btf.views.vectors
         near = np.flatnonzero(views[:, 2] >= np.cos(LARGEST_ANGLE))
         a, b = (near[i] for i in np.triu_indices(len(near), 1))
@@ -58,9 +68,14 @@ class ReciprocalPairs:
             a, b = a[chosen], b[chosen]
         self._views = np.stack([a, b], 1)
         self.first, self.second = views[a], views[b]
-        self._light, self._share = btf.lights.stencil(views, hold=False)
-        some = np.asarray(btf.values[:: max(1, len(views) // 8), ::8], np.float32)
-        self.black = BLACK * float((some @ LUMINANCE.astype(np.float32)).mean()) + 1e-12
+        self.black = BLACK * mean_luminance(btf, 8) + 1e-12
+        under: dict[int, list[int]] = {}
+        for one, other in self._views.tolist():
+            under.setdefault(one, []).append(other)
+            under.setdefault(other, []).append(one)
+        wanted = _Wanted(under, *btf.lights.stencil(views, hold=False))
+        found = over_blocks(btf, _images, wanted, range(len(views)))
+        self._images = {(view, light): image for view, light, image in found}
 
     def __len__(self) -> int:
         return len(self._views)
@@ -72,20 +87,47 @@ class ReciprocalPairs:
         -------
         tuple of ndarray of float32, shape (rows, columns)
         """
-        a, b = self._views[pair]
-        return self._image(a, b), self._image(b, a)
+        a, b = self._views[pair].tolist()
+        return self._images[a, b], self._images[b, a]
 
     def logarithms(self, pair: int) -> tuple[np.ndarray, np.ndarray]:
         """Natural logarithms of :meth:`images`, held at ``black``."""
         return tuple(np.log(np.maximum(image, self.black)) for image in self.images(pair))
 
-    def _image(self, view: int, light: int) -> np.ndarray:
-        total = np.zeros(self.shape, np.float32)
-        for index, share in zip(self._light[light], self._share[light], strict=True):
+
+@dataclass(frozen=True)
+class _Wanted:
+    """Images that take part: view → views whose directions light it, and the lights that stand for such a direction."""
+
+    under: dict[int, list[int]]
+    light: np.ndarray
+    share: np.ndarray
+
+
+def _images(btf: BTFBlocks, wanted: _Wanted, view: int) -> Iterator[tuple[int, int, np.ndarray]]:
+    """The images of a view, whose values are checked."""
+    values = btf.view(view)
+    refuse_not_finite(values, btf)
+    for other in wanted.under.get(view, ()):
+        total = np.zeros(btf.texels, np.float32)
+        for index, share in zip(wanted.light[other], wanted.share[other], strict=True):
             if share:
-                image = np.asarray(self._btf.values[view, index], np.float32) @ LUMINANCE.astype(np.float32)
+                image = np.asarray(values[index], np.float32) @ LUMINANCE.astype(np.float32)
                 total += np.float32(share) * image
-        return total
+        yield view, other, total
+
+
+def mean_luminance(btf: BTFBlocks, every: int) -> float:
+    """Mean luminance of some of a BTF's samples, 1/sr: of eight views or some more, and of every so many lights."""
+    views = range(0, len(btf.views), max(1, len(btf.views) // 8))
+    sums = list(over_blocks(btf, _luminance, every, views))
+    return sum(total for total, _ in sums) / sum(count for _, count in sums)
+
+
+def _luminance(btf: BTFBlocks, every: int, view: int) -> Iterator[tuple[float, int]]:
+    """Sum and number of a view's luminances."""
+    found = np.asarray(btf.view(view)[::every], np.float32) @ LUMINANCE.astype(np.float32)
+    yield float(found.sum(dtype=float)), found.size
 
 
 def tangent(w: ArrayLike) -> np.ndarray:
@@ -123,7 +165,9 @@ def shifted(image: np.ndarray, offset: ArrayLike) -> np.ndarray:
     return result
 
 
-def surface_stencil(heights: np.ndarray, view_tangent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def surface_stencil(
+    heights: np.ndarray, view_tangent: np.ndarray, part: slice = slice(None)
+) -> tuple[np.ndarray, np.ndarray]:
     """Texels that show the points of a height map from a view, and their weights.
 
     Parameters
@@ -131,17 +175,20 @@ def surface_stencil(heights: np.ndarray, view_tangent: np.ndarray) -> tuple[np.n
     heights : ndarray, shape (rows, columns)
         Tile units.
     view_tangent : ndarray, shape (2,)
+    part : slice
+        Of the flat index: these points.
 
     Returns
     -------
-    index : ndarray of int, shape (rows * columns, 4)
+    index : ndarray of int, shape (n, 4)
         Flat.
-    weight : ndarray of float32, shape (rows * columns, 4)
+    weight : ndarray of float32, shape (n, 4)
     """
     from btfref.conventions import texel_stencil
 
     rows, columns = heights.shape
-    v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
-    uv = np.stack([u, v], -1) - heights[..., None] * view_tangent
-    index, weight = texel_stencil(uv.reshape(-1, 2), heights.shape, "bilinear")
+    row, column = np.divmod(np.arange(heights.size)[part], columns)
+    uv = np.stack([(column + 0.5) / columns, (row + 0.5) / rows], -1)
+    uv -= heights.reshape(-1)[part, None] * view_tangent
+    index, weight = texel_stencil(uv, heights.shape, "bilinear")
     return index, weight.astype(np.float32)

@@ -14,18 +14,15 @@ from btfref.representations.gbrdf.build import from_maps
 from btfref.representations.gbrdf.decomposition import heights as height_stage
 from btfref.representations.gbrdf.decomposition.materials import cluster_materials
 from btfref.representations.gbrdf.decomposition.normals import fuse, helmholtz_normals
-from btfref.representations.gbrdf.decomposition.pairs import N_PAIRS, ReciprocalPairs
-from btfref.representations.gbrdf.decomposition.reflectance import (
-    SurfaceSamples,
-    material_reflectance,
-    texel_reflectance,
-)
-from btfref.representations.lookup import positive_integer, refuse_not_finite
+from btfref.representations.gbrdf.decomposition.pairs import N_PAIRS, ReciprocalPairs, mean_luminance
+from btfref.representations.gbrdf.decomposition.reflectance import material_reflectance, texel_reflectance
+from btfref.representations.gbrdf.decomposition.samples import GROUP, SurfaceSamples, texels_together
+from btfref.representations.lookup import positive_integer
 from btfref.representations.protocol import FitMemory
 
 if TYPE_CHECKING:
     from btfref.representations.gbrdf.definition import Representation
-    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.blocks import BTFBlocks
     from btfref.types import PathLike, Progress
 
 
@@ -33,7 +30,7 @@ if TYPE_CHECKING:
 SIMILARITIES = ("reciprocity", "correlation")
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(5.0)
+FIT_MEMORY = FitMemory(view=4, rows=6, texels=2 * GROUP, texel=16_000, field=4, scales=("layers", "pairs"))
 
 #: "paper": correlation in windows of 5 × 5 and depth weight 0.2 (section 6). The unit of the paper's smoothness, 0.1,
 #: is not given; in ours 0.1 flattens everything, 0.02 is the best for the correlation.
@@ -44,7 +41,7 @@ PRESETS = {
 
 @reproducible()
 def fit(
-    btf: SampledBTF,
+    btf: BTFBlocks,
     *,
     seed: int = 0,
     progress: Progress | None = None,
@@ -67,7 +64,7 @@ def fit(
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
     seed : int
         Same seed, same result.
     progress : callable, optional
@@ -136,10 +133,8 @@ def fit(
     if similarity not in SIMILARITIES:
         expected = " or ".join(SIMILARITIES)
         raise InputError("a parameter is out of range", field="similarity", got=similarity, expected=expected)
-    for view in btf.values:
-        refuse_not_finite(view, btf)
     report = progress or (lambda *_: None)
-    shape = btf.values.shape[2:4]
+    shape, together = btf.texels, texels_together(btf)
     reciprocal = ReciprocalPairs(btf, pairs, seed)
     stages = {"layers": height_stage.height_layers(depth, layers)}
     if not len(reciprocal):
@@ -162,7 +157,9 @@ def fit(
     low, high = float(fused.min()), float(fused.max())
     unit = (fused - low) / (high - low) if high > low else np.ones(shape)
     surface_heights = HeightField((low + (high - low) * unit).astype(np.float32))
-    texels = texel_reflectance(SurfaceSamples(btf, surface_heights, stride=2), progress=report)
+    mean = mean_luminance(btf, 4)
+    points = SurfaceSamples(btf, surface_heights, stride=2, mean=mean)
+    texels = texel_reflectance(btf, points, together=together, progress=report)
     stages |= {f"texel_{name}": values for name, values in texels.items()}
     clustering, separation = cluster_materials(
         texels["ndf"], shape, largest=largest, count=materials, seed=seed
@@ -170,9 +167,15 @@ def fit(
     labels, n_materials = clustering.labels, len(clustering.centres)
     stages["labels"], stages["rotation"] = labels.reshape(shape), clustering.rotation.reshape(shape)
     stages["separation"] = np.array(list(separation.items()))
-    surface = SurfaceSamples(btf, surface_heights, stages["rotation"])
     found = material_reflectance(
-        surface, labels, n_materials, size=ndf_size, iterations=iterations, progress=report
+        btf,
+        SurfaceSamples(btf, surface_heights, stages["rotation"], mean=mean),
+        labels,
+        n_materials,
+        size=ndf_size,
+        iterations=iterations,
+        together=together,
+        progress=report,
     )
     parameters = {
         "seed": seed,

@@ -1,8 +1,6 @@
 """Reflectance of each texel by alternating least squares, once heights and normals are known.
 
-Source: Menzel and Guthe 2009, eq. 9 to 20. Every residual is weighted by 1/L, so that it is the logarithmic error; L is
-held above a share of the mean, so that weights stay finite in float32. Push–pull after S. Gortler et al., "The
-Lumigraph", SIGGRAPH 1996.
+Source: Menzel and Guthe 2009, eq. 9 to 20. Push–pull after S. Gortler et al., "The Lumigraph", SIGGRAPH 1996.
 """
 
 from __future__ import annotations
@@ -13,165 +11,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from btfref.conventions import LUMINANCE
-from btfref.numerics.microfacets import fifth_power, geometry_factor
-from btfref.numerics.sphere.frames import surface_frame
 from btfref.numerics.sphere.parabolic import texel_solid_angles
-from btfref.representations.gbrdf.decomposition.normals import visible
-from btfref.representations.gbrdf.decomposition.pairs import surface_stencil, tangent
+from btfref.representations.gbrdf.decomposition.samples import BLOCK
+from btfref.sampling.passes import over_blocks
 
 if TYPE_CHECKING:
-    from btfref.numerics.heightfield import HeightField
-    from btfref.sampling.sampled_btf import SampledBTF
+    from collections.abc import Iterator
+
+    from btfref.representations.gbrdf.decomposition.samples import BlockSamples, SurfaceSamples
+    from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Progress
 
-
-#: Texels a block: bounds the memory of their tables.
-BLOCK = 128
-
-#: Cosines to the local normal below which a sample is left out: there the height map decides, not the material.
-GRAZING = 0.1
-
-#: Share of a texel's mean luminance at which the weight 1 / L ends: borders of shadows that the heights miss by a texel
-#: are dark samples of lit points, and would count hundreds of times. Chosen on BTFs of random height maps with coloured
-#: textures, which no other figure is of: RMS ΔE00 4.2, 3.8, 3.4, 3.4, 3.4, 3.5 and 2.9, 2.0, 1.9, 1.9, 1.9, 1.9 for
-#: shares of 0.03, 0.1, 0.2, 0.3, 0.5, 1, least at 0.3 for both (0.12 and 0.05 tiles deep, GGX 0.35 and 0.2).
-FLOOR = 0.3
 
 #: r0 to start from: a refractive index of 1.5.
 FIRST_FRESNEL = 0.04
 
 #: Texels per side of the table of a single texel's distribution.
 TEXEL_NDF = 16
-
-
-@dataclass(frozen=True)
-class BlockSamples:
-    """What the surface points of a block of N texels show; P pairs (view, light), view slowest.
-
-    Everything is multiplied by the weight: 1 / L where seen, lit and not grazing, else 0.
-
-    Attributes
-    ----------
-    values : ndarray of float32, shape (channels, P, N)
-        B in 1/sr.
-    light : ndarray of float32, shape (P, N)
-        k1·n / π.
-    factor : ndarray of float32, shape (P, N)
-        k1·n over the denominator of the BRDF.
-    place : ndarray of intp, shape (P, N)
-        Flat index of the half vector's texel in the table [group, row, column] of distributions.
-    fifth : ndarray of float32, shape (P, 1)
-        (1 − k1·h)^5, without the weight.
-    """
-
-    values: np.ndarray
-    light: np.ndarray
-    factor: np.ndarray
-    place: np.ndarray
-    fifth: np.ndarray
-
-    def fresnel(self, r0: np.ndarray) -> np.ndarray:
-        """F(k1·h), shape (N,) -> (P, N)."""
-        return self.fifth + r0 * (1 - self.fifth)
-
-
-class SurfaceSamples:
-    """BlockSamples of a BTF on a height field.
-
-    Parameters
-    ----------
-    btf : SampledBTF
-    field : btfref.numerics.heightfield.HeightField
-    rotation : ndarray, shape (rows, columns), optional
-        Of the tangents, in turns.
-    stride : int
-        Every so many views only.
-    """
-
-    def __init__(
-        self, btf: SampledBTF, field: HeightField, rotation: np.ndarray | None = None, stride: int = 1
-    ) -> None:
-        self._btf, self._field = btf, field
-        self._views = np.flatnonzero(btf.views.vectors[:, 2] > 1e-6)[::stride]
-        views, lights = btf.views.vectors[self._views], btf.lights.vectors
-        self._directions = views.astype(np.float32), lights.astype(np.float32)
-        self.n_texels = int(np.prod(field.shape))
-        self._seen, self._lit = visible(field, views), visible(field, lights)
-        heights = field.heights.astype(float)
-        self._stencils = [surface_stencil(heights, tangent(view)) for view in views]
-        turn = np.zeros(field.shape) if rotation is None else 2 * np.pi * rotation
-        surface = np.concatenate([field.slopes, np.cos(turn)[..., None], np.sin(turn)[..., None]], -1)
-        self._frame = np.stack(surface_frame(surface.reshape(-1, 4)), 1).astype(np.float32)
-        half = views[:, None] + lights[None]
-        half /= np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-12)
-        self._half = half.reshape(-1, 3).astype(np.float32)
-        self._fifth = fifth_power((half * lights).sum(-1)).reshape(-1, 1).astype(np.float32)
-        self._black = 0.02 * mean_luminance(btf)
-
-    def blocks(self) -> list[slice]:
-        """Texels of each block, as slices of the flat index."""
-        return [slice(i, min(i + BLOCK, self.n_texels)) for i in range(0, self.n_texels, BLOCK)]
-
-    def read(
-        self, part: slice, size: int, group: np.ndarray | None = None, colour: bool = True
-    ) -> BlockSamples:
-        """BlockSamples of some texels.
-
-        Parameters
-        ----------
-        part : slice
-            Of the flat index.
-        size : int
-            Texels per side of the distributions.
-        group : ndarray of int, shape (N,), optional
-            Which distribution each texel uses; default: its own.
-        colour : bool
-            Three channels, or luminance alone.
-
-        Returns
-        -------
-        BlockSamples
-        """
-        views, lights = self._directions
-        frame = self._frame[part]
-        n, n_views, n_lights = len(frame), len(views), len(lights)
-        tables = np.zeros((3, n_views, n_lights, n), np.float32)
-        for row, (view, (index, share)) in enumerate(zip(self._views, self._stencils, strict=True)):
-            images = self._btf.values[view].reshape(n_lights, -1, 3)
-            seen = sum(
-                images[:, index[part, k]].astype(np.float32) * share[part, k, None]
-                for k in range(index.shape[1])
-            )
-            tables[:, row] = np.moveaxis(seen, -1, 0)
-        values = tables.reshape(3, -1, n)
-        luminance = np.tensordot(LUMINANCE.astype(np.float32), values, 1)
-        cos_view, cos_light = views @ frame[:, 2].T, lights @ frame[:, 2].T
-        there = (self._seen[part].T & (cos_view > GRAZING))[:, None]
-        there = there & (self._lit[part].T & (cos_light > GRAZING))[None]
-        x, y, z = (self._half @ frame[:, k].T for k in range(3))
-        there = there.reshape(-1, n) & (z > 0)
-        mean = np.einsum("pn,pn->n", luminance, there) / np.maximum(there.sum(0), 1)
-        weight = there / np.maximum(luminance, np.maximum(np.float32(FLOOR) * mean, np.float32(self._black)))
-        scale = np.float32(0.5 * size) / (1 + np.maximum(z, 0))
-        column, row = (
-            np.clip(w * scale + np.float32(0.5 * size), 0, size - 1).astype(np.intp) for w in (x, y)
-        )
-        group = np.arange(n) if group is None else group
-        factor = geometry_factor(cos_light[None], cos_view[:, None]).astype(np.float32).reshape(-1, n)
-        light = np.broadcast_to(cos_light[None], (n_views, n_lights, n)).reshape(-1, n)
-        return BlockSamples(
-            (values if colour else luminance[None]) * weight,
-            light * weight * np.float32(1 / np.pi),
-            factor * weight,
-            (group * size + row) * size + column,
-            self._fifth,
-        )
-
-
-def mean_luminance(btf: SampledBTF) -> float:
-    """Mean luminance of some of a BTF's samples in 1/sr, a little above 0 for a black one."""
-    some = np.asarray(btf.values[:: max(1, len(btf.views) // 8), ::4], np.float32)
-    return float((some @ LUMINANCE.astype(np.float32)).mean()) + 1e-9
 
 
 def diffuse_colour(channel: np.ndarray, samples: BlockSamples, gloss: np.ndarray) -> np.ndarray:
@@ -275,15 +131,24 @@ def _finer(table: np.ndarray) -> np.ndarray:
 
 
 def texel_reflectance(
-    surface: SurfaceSamples, *, iterations: int = 5, progress: Progress | None = None
+    btf: BTFBlocks,
+    surface: SurfaceSamples,
+    *,
+    iterations: int = 5,
+    together: int = BLOCK,
+    progress: Progress | None = None,
 ) -> dict[str, np.ndarray]:
     """Parameters of each texel on its own, in luminance: what clustering needs.
 
     Parameters
     ----------
+    btf : BTFBlocks
     surface : SurfaceSamples
+        Of its points.
     iterations : int
         Alternations c_d, p, c_s, r0.
+    together : int
+        See :func:`texels_together`.
     progress : callable, optional
 
     Returns
@@ -295,8 +160,21 @@ def texel_reflectance(
     n = surface.n_texels
     result = {name: np.zeros(n) for name in ("diffuse", "specular", "fresnel")}
     result["ndf"] = np.zeros((n, size, size))
-    for part in surface.blocks():
-        samples = surface.read(part, size, colour=False)
+    for part, found in over_blocks(btf, _of_texels, (surface, iterations), surface.groups(together)):
+        for name, values in found.items():
+            result[name][part] = values
+        if progress:
+            progress(part.stop, n, "reflectance")
+    return result
+
+
+def _of_texels(
+    btf: BTFBlocks, shared: tuple[SurfaceSamples, int], group: slice
+) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
+    """The parameters of the texels of a group, block by block."""
+    surface, iterations = shared
+    size = TEXEL_NDF
+    for part, samples in surface.each(btf, group, size, colour=False):
         channel = samples.values[0]
         count = channel.shape[1]
         r0, specular = np.full(count, FIRST_FRESNEL, np.float32), np.ones(count, np.float32)
@@ -312,20 +190,18 @@ def texel_reflectance(
             p = table.ravel().astype(np.float32)[samples.place]
             specular = np.clip(specular_amount(rest, p * shape), 0, 1 - diffuse)
             r0 = normal_reflectance(rest, specular * p * samples.factor, samples)
-        result["diffuse"][part], result["specular"][part] = diffuse, specular
-        result["fresnel"][part], result["ndf"][part] = r0, table
-        if progress:
-            progress(part.stop, n, "reflectance")
-    return result
+        yield part, {"diffuse": diffuse, "specular": specular, "fresnel": r0, "ndf": table}
 
 
 def material_reflectance(
+    btf: BTFBlocks,
     surface: SurfaceSamples,
     labels: np.ndarray,
     n_materials: int,
     *,
     size: int = 32,
     iterations: int = 4,
+    together: int = BLOCK,
     progress: Progress | None = None,
 ) -> dict[str, np.ndarray]:
     """Distributions of the materials, and c_d and r0 of the texels, in colour.
@@ -334,13 +210,16 @@ def material_reflectance(
 
     Parameters
     ----------
+    btf : BTFBlocks
     surface : SurfaceSamples
-        With the rotation of the tangents.
+        Of its points, with the rotation of the tangents.
     labels : ndarray of int, shape (n,)
     n_materials : int
     size : int
         Texels per side of the distributions, a power of two.
     iterations : int
+    together : int
+        See :func:`texels_together`.
     progress : callable, optional
 
     Returns
@@ -349,27 +228,19 @@ def material_reflectance(
         ``diffuse`` (n, 3), ``fresnel`` (n,), ``ndf`` (n_materials, size, size, 3) of largest integral 1, ``specular``
         (n_materials,): c_s.
     """
-    n, grey = surface.n_texels, LUMINANCE.astype(np.float32)
+    n = surface.n_texels
     # c_s p, the product that the data determine; it is taken apart at the end.
     product = np.zeros((3, n_materials, size, size))
     diffuse, r0 = np.zeros((n, 3)), np.full(n, FIRST_FRESNEL, np.float32)
     for turn in range(iterations):
         sums = np.zeros((2, 3, n_materials * size * size))
         table = product.reshape(3, -1).astype(np.float32)
-        for part in surface.blocks():
-            samples = surface.read(part, size, labels[part])
-            p = table[:, samples.place]
-            shape = samples.fresnel(r0[part]) * samples.factor
-            found = [diffuse_colour(samples.values[c], samples, p[c] * shape) for c in range(3)]
-            diffuse[part] = np.stack(found, -1)
-            rest = [samples.values[c] - found[c] * samples.light for c in range(3)]
-            if turn:
-                of_grey = np.tensordot(grey, p, 1) * samples.factor
-                all_rest = sum(k * r for k, r in zip(grey, rest, strict=True))
-                r0[part] = normal_reflectance(all_rest, of_grey, samples)
-                shape = samples.fresnel(r0[part]) * samples.factor
-            for c in range(3):
-                sums[:, c] += distribution(rest[c], shape, samples, sums.shape[-1])
+        state = _Materials(surface, labels, table, r0.copy(), size, turn > 0)
+        for part, colours, fresnel, of_block in over_blocks(
+            btf, _of_materials, state, surface.groups(together)
+        ):
+            diffuse[part], r0[part] = colours, fresnel
+            sums += of_block
             if progress:
                 progress(turn * n + part.stop, iterations * n, "materials' reflectance")
         found = np.maximum(_quotient(*sums), 0).reshape(3, n_materials, size, size)
@@ -388,3 +259,34 @@ def material_reflectance(
         "ndf": np.moveaxis(ndf, 0, -1),
         "specular": np.clip(total, 0, 1),
     }
+
+
+@dataclass(frozen=True)
+class _Materials:
+    """What a turn starts with: the points, their materials, c_s p of these, r0, and whether r0 is looked for."""
+
+    surface: SurfaceSamples
+    labels: np.ndarray
+    table: np.ndarray
+    r0: np.ndarray
+    size: int
+    fresnel: bool
+
+
+def _of_materials(
+    btf: BTFBlocks, state: _Materials, group: slice
+) -> Iterator[tuple[slice, np.ndarray, np.ndarray, np.ndarray]]:
+    """c_d and r0 of the texels of a group, and sums for the distributions, block by block."""
+    grey = LUMINANCE.astype(np.float32)
+    for part, samples in state.surface.each(btf, group, state.size, state.labels):
+        r0, p = state.r0[part], state.table[:, samples.place]
+        shape = samples.fresnel(r0) * samples.factor
+        found = [diffuse_colour(samples.values[c], samples, p[c] * shape) for c in range(3)]
+        rest = [samples.values[c] - found[c] * samples.light for c in range(3)]
+        if state.fresnel:
+            of_grey = np.tensordot(grey, p, 1) * samples.factor
+            all_rest = sum(k * r for k, r in zip(grey, rest, strict=True))
+            r0 = normal_reflectance(all_rest, of_grey, samples)
+            shape = samples.fresnel(r0) * samples.factor
+        sums = [distribution(rest[c], shape, samples, state.table.shape[-1]) for c in range(3)]
+        yield part, np.stack(found, -1), r0, np.stack(sums, 1)

@@ -1,0 +1,1 @@
+"""Tasks of a Dask cluster, whatever they make."""
