@@ -146,9 +146,10 @@ def _kept(radiance: np.ndarray, mean: float) -> np.ndarray:
 
 
 class _Receivers:
-    """Random surfaces, half Lambertian and half a lobe: what they see of lights, and what the filtered maps show.
+    """Random lobes over random surfaces: what they see of lights, and what the filtered maps show.
 
-    The maps' own resolution is left out: it is a tenth of what the horizon costs.
+    Nothing diffuse, which would hide their error: a metal has no such part. The maps' own resolution is left out: it is
+    a tenth of what the horizon costs.
     """
 
     def __init__(self, edge: float, cosine: bool) -> None:
@@ -178,16 +179,14 @@ class _Receivers:
         exponents = prefilter.exponents().astype(np.float32)
         low, high = exponents[self.low, None], exponents[self.low + 1, None]
         f = self.between[:, None]
-        # Shares are of lobes whose integral over the sphere is 2π / (n + 1), which is π after the receivers' scale.
+        # Shares are of lobes whose integral over the sphere is 2π / (n + 1), which is π after this scale.
         scale = (self.exponent[:, None] + 1) / 2
         with np.errstate(under="ignore"), one_blas_thread():
             for first in range(0, len(w), BLOCK):
                 part = slice(first, first + BLOCK)
                 some = luminance[part]
                 z, along, *moved = (a @ w[part].T.astype(np.float32) for a in single)
-                lambert = np.maximum(z, 0) @ some
-                true[...] += lambert + scale * (self._lobe(z, along) @ some)
-                shown[...] += lambert
+                true[...] += scale * (self._lobe(z, along) @ some)
                 for logs in map(_log, moved):
                     mean = (1 - f) * (low + 1) * (np.exp(low * logs) @ some)
                     mean += f * (high + 1) * (np.exp(high * logs) @ some)
