@@ -74,14 +74,20 @@ class Demand:
             maps={},
         )
 
-    def tiles(self, side: int) -> np.ndarray:
-        """Tiles of ``side`` × ``side`` texels that hold a needed one, shape (tile rows, tile columns) bool."""
-        rows, columns = (-(-n // side) for n in self.texels.shape)
-        padded = np.zeros((rows * side, columns * side), bool)
-        padded[: self.texels.shape[0], : self.texels.shape[1]] = self.texels
-        return np.any(padded.reshape(rows, side, columns, side), axis=(1, 3))
+    def tiles(self, most: int) -> np.ndarray:
+        """Tiles that hold a needed texel, shape (tile rows, tile columns) bool.
 
-    def part(self, side: int | None = None) -> Selection:
+        They are those of a store, with at most ``most`` texels a side: `btfref.sampling.store.layout.side_of`.
+        """
+        from btfref.sampling.store.layout import side_of
+
+        high, wide = (side_of(n, most) for n in self.texels.shape)
+        rows, columns = -(-self.texels.shape[0] // high), -(-self.texels.shape[1] // wide)
+        padded = np.zeros((rows * high, columns * wide), bool)
+        padded[: self.texels.shape[0], : self.texels.shape[1]] = self.texels
+        return np.any(padded.reshape(rows, high, columns, wide), axis=(1, 3))
+
+    def part(self, most: int | None = None) -> Selection:
         """What to synthesize: a `btfref.sampling.store.selection.Selection` of pairs, and of tiles as stores have them.
 
         Raises
@@ -92,7 +98,7 @@ class Demand:
         from btfref.sampling.store.layout import TILE
         from btfref.sampling.store.selection import Selection
 
-        tiles = np.flatnonzero(self.tiles(side or TILE))
+        tiles = np.flatnonzero(self.tiles(most or TILE))
         if not self.pairs.any() or not len(tiles):
             raise InputError("the scene needs nothing of this BTF", file=self.file, field="demand")
         return Selection.of_pairs(self.pairs, tiles.tolist())

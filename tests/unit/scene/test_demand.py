@@ -117,6 +117,9 @@ def test_union_and_parts():
     assert one.part() == Selection((1, 3), (0,), (0,))
     assert both.part(64) == Selection(tiles=(0, 3), pairs=((1, (0, 2)), (3, (0,))))
     assert both.tiles(32).sum() == 2
+    # Tiles as stores have them, here of 50 × 35 texels: as alike as they can be.
+    assert some([1], [2], (55, 36)).part() == Selection((1,), (2,), (3,))
+    assert some([1], [2], (49, 36)).part() == Selection((1,), (2,), (1,))
     with pytest.raises(InputError, match="needs nothing"):
         some([], [0], (0, 0)).part()
     with pytest.raises(InputError, match="different shapes"):
