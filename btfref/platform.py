@@ -141,6 +141,20 @@ def prepare_llvm() -> str:
     return choice.path
 
 
+def use_processors(threads: int) -> None:
+    """Tell Dr.Jit how many threads it may use, at least two: with one Mitsuba waits forever for an OpenEXR file.
+
+    Parameters
+    ----------
+    threads : int
+    """
+    import drjit as dr
+
+    wanted = max(2, threads)
+    if dr.thread_count() != wanted:
+        dr.set_thread_count(wanted)
+
+
 def set_variant(name: str) -> None:
     """Set a variant of Mitsuba.
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from btfref.errors import InputError
 from btfref.numerics.solvers.threads import reproducible
+from btfref.platform import use_processors
 from btfref.sampling import memory
 from btfref.sampling.blocks import StreamedBTF
 
@@ -239,10 +240,7 @@ def _made(order: Order, work: Work[S, I, R], shared: S, items: list[I]) -> tuple
         btf = _opened(order)
         threads = order.means["threads"]
         if threads is not None and "drjit" in sys.modules:
-            import drjit as dr
-
-            if dr.thread_count() != threads:
-                dr.set_thread_count(threads)
+            use_processors(threads)
         with reproducible(threads):
             return [list(work(btf, shared, item)) for item in items], memory.peak()
 

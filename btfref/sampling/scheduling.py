@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, TypedDict, TypeVar
 
 from btfref.errors import InputError, MissingDependencyError
+from btfref.platform import use_processors
 from btfref.sampling.cluster.tasks import hand_out
 from btfref.sampling.fill_views import fill_views
 from btfref.sampling.memory import default_budget, peak
@@ -302,7 +303,4 @@ def use_threads(variant: str, threads: int) -> None:
     from btfref.sampling.variant import mitsuba_variant
 
     with mitsuba_variant(variant):
-        import drjit as dr
-
-        if dr.thread_count() != threads:
-            dr.set_thread_count(threads)
+        use_processors(threads)

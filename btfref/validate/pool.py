@@ -139,15 +139,10 @@ def use_threads(threads: int) -> None:
     """Tell OpenGL, before its driver is there, and Dr.Jit their threads: too many would only wait for each other."""
     os.environ["LP_NUM_THREADS"] = str(threads)
     from btfref.errors import MissingDependencyError
-    from btfref.platform import prepare_llvm
+    from btfref.platform import prepare_llvm, use_processors
 
     try:
         prepare_llvm()
     except MissingDependencyError:
         return  # the jobs say so
-    import drjit as dr
-
-    # With a single thread Mitsuba waits forever for an OpenEXR file (the sky of a scene of the user's).
-    wanted = max(2, threads)
-    if dr.thread_count() != wanted:
-        dr.set_thread_count(wanted)
+    use_processors(threads)

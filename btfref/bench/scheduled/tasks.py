@@ -16,6 +16,7 @@ from btfref.bench import measures
 from btfref.bench.subjects import Built, build
 from btfref.bench.timing import machine
 from btfref.errors import InputError
+from btfref.platform import use_processors
 from btfref.provenance.told import accepted
 
 if TYPE_CHECKING:
@@ -135,10 +136,7 @@ def _accepted(order: str, threads: int) -> Iterator[None]:
     with LOCK, threadpool_limits(threads):
         accepted(order)
         if "drjit" in sys.modules:
-            import drjit as dr
-
-            if dr.thread_count() != threads:
-                dr.set_thread_count(threads)
+            use_processors(threads)
         yield
 
 

@@ -201,3 +201,18 @@ def test_the_registry_knows_who_can():
     with pytest.raises(InputError, match="prefiltered") as caught:
         image_light("raw", file="x.raw.exr")
     assert "rf_lobes" in caught.value.expected
+
+
+def test_pictures_are_read_after_one_thread_was_asked_for(llvm, tmp_path, rng):
+    """A worker with one thread that reads a sky must not wait forever."""
+    import drjit as dr
+
+    from btfref.platform import use_processors
+
+    before = dr.thread_count()
+    use_processors(1)
+    try:
+        llvm.Bitmap(rng.random((4, 8, 3)).astype(np.float32)).write(str(tmp_path / "sky.exr"))
+        assert np.array(llvm.Bitmap(str(tmp_path / "sky.exr"))).shape == (4, 8, 3)
+    finally:
+        dr.set_thread_count(before)
