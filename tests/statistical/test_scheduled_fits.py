@@ -3,9 +3,9 @@
 import dataclasses
 import os
 import signal
-from pathlib import Path
 
 import pytest
+from clusters import in_this_process, of_processes
 from oracle import oracle_btf
 
 from btfref.cli import main
@@ -38,30 +38,14 @@ def distributed(need):
 @pytest.fixture(scope="module")
 def one(distributed):
     """A client of one worker, in this process."""
-    local = distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0", silence_logs=50
-    )
-    with local, distributed.Client(local) as client:
+    with in_this_process(distributed) as local, distributed.Client(local) as client:
         yield client
-
-
-def processes(distributed, count):
-    """A cluster of processes."""
-    root = str(Path(__file__).parents[2])
-    os.environ["PYTHONPATH"] = os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])
-    return distributed.LocalCluster(
-        n_workers=count,
-        threads_per_worker=1,
-        dashboard_address="127.0.0.1:0",
-        memory_limit=0,
-        silence_logs=50,
-    )
 
 
 @pytest.fixture(scope="module")
 def two(distributed):
     """A client of two workers, each a process of its own."""
-    with processes(distributed, 2) as local, distributed.Client(local) as client:
+    with of_processes(distributed, 2) as local, distributed.Client(local) as client:
         yield client
 
 
@@ -95,7 +79,7 @@ def test_the_number_of_workers_changes_no_byte(tmp_path, path, one, two, key, mo
 @pytest.mark.long
 def test_four_workers_change_no_byte(tmp_path, path, distributed, monkeypatch):
     monkeypatch.setattr("btfref.representations.analytic.light_functions.BLOCK", 5)
-    with processes(distributed, 4) as local, distributed.Client(local) as client:
+    with of_processes(distributed, 4) as local, distributed.Client(local) as client:
         for key in KEYS:
             assert fitted(tmp_path, path, key, client) == fitted(tmp_path, path, key)
 
@@ -106,7 +90,7 @@ def test_a_worker_that_is_killed_in_a_fit_loses_nothing(tmp_path, distributed, k
     path = tmp_path / "x.btf.zarr"
     oracle_btf((24, 24), views="4x6", lights="8x6").save(path)
     alone, killed = fitted(tmp_path, path, key), []
-    with processes(distributed, 2) as local, distributed.Client(local) as client:
+    with of_processes(distributed, 2) as local, distributed.Client(local) as client:
         before = client.run(os.getpid)
 
         def kill(done, total, label):

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from clusters import in_this_process, of_processes
 from oracle import oracle_btf
 
 from btfref.bench import matrix
@@ -42,28 +43,14 @@ def distributed(need):
 @pytest.fixture(scope="module")
 def one(distributed):
     """A client of one worker, in this process."""
-    local = distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0", silence_logs=50
-    )
-    with local, distributed.Client(local) as client:
+    with in_this_process(distributed) as local, distributed.Client(local) as client:
         yield client
 
 
 @pytest.fixture(scope="module")
 def two(distributed):
     """A client of two workers, each a process of its own."""
-    root = str(Path(__file__).parents[2])
-    os.environ["PYTHONPATH"] = os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])
-    with (
-        distributed.LocalCluster(
-            n_workers=2,
-            threads_per_worker=1,
-            dashboard_address="127.0.0.1:0",
-            memory_limit=0,
-            silence_logs=50,
-        ) as local,
-        distributed.Client(local) as client,
-    ):
+    with of_processes(distributed, 2) as local, distributed.Client(local) as client:
         yield client
 
 
@@ -285,10 +272,7 @@ def _alone(path, number):
 
 
 def test_what_is_timed_is_alone_on_its_machine(tmp_path, distributed):
-    local = distributed.LocalCluster(
-        n_workers=2, threads_per_worker=2, processes=False, dashboard_address="127.0.0.1:0", silence_logs=50
-    )
-    with local, distributed.Client(local) as client:
+    with in_this_process(distributed, 2, 2) as local, distributed.Client(local) as client:
         pieces = [(tmp_path, number) for number in range(4)]
         found = list(one_a_machine(client, _alone, pieces, tmp_path))
     assert sorted(found) == [(0, 0), (1, 0), (2, 0), (3, 0)]

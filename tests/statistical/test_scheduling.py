@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from clusters import of_processes
 from stores import contents
 
 from btfref.cli import main
@@ -29,18 +30,7 @@ def cluster(need):
     need("distributed")
     import distributed
 
-    root = str(Path(__file__).parents[2])
-    os.environ["PYTHONPATH"] = os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])
-    with (
-        distributed.LocalCluster(
-            n_workers=2,
-            threads_per_worker=1,
-            dashboard_address="127.0.0.1:0",
-            memory_limit=0,
-            silence_logs=50,
-        ) as local,
-        distributed.Client(local) as client,
-    ):
+    with of_processes(distributed, 2) as local, distributed.Client(local) as client:
         yield client
 
 
