@@ -14,6 +14,6 @@ def in_this_process(distributed, count=1, threads=1):
 
 def of_processes(distributed, count):
     """A cluster whose workers are processes of one thread, with this checkout."""
-    root = str(Path(__file__).parents[2])
+    root = str(Path(__file__).parents[1])
     os.environ["PYTHONPATH"] = os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])
     return distributed.LocalCluster(n_workers=count, threads_per_worker=1, memory_limit=0, **QUIET)

@@ -174,7 +174,7 @@ def test_a_worker_that_is_killed_in_a_validation_loses_nothing(tmp_path, plain, 
 @pytest.mark.usefixtures("renderers")
 def test_a_worker_of_other_code_is_refused_and_nothing_is_kept(tmp_path, distributed):
     """A copy of the packages in which one port has another text."""
-    root, copy, cache = Path(__file__).parents[2], tmp_path / "copy", tmp_path / "cache"
+    root, copy, cache = Path(__file__).parents[3], tmp_path / "copy", tmp_path / "cache"
     for package in ("btfref", "mitsuba_plugins", "shaders"):
         shutil.copytree(root / package, copy / package, ignore=shutil.ignore_patterns("__pycache__"))
     edited = copy / "mitsuba_plugins" / "lpca.py"

@@ -120,7 +120,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(tmp_path, capsys):
 def test_a_scheduler_that_dies_is_one_line_and_the_run_goes_on(tmp_path, need):
     """What was made before stays; the same command without it ends with the same bytes."""
     need("distributed")
-    root = str(Path(__file__).parents[2])
+    root = str(Path(__file__).parents[3])
     environment = os.environ | {"PYTHONPATH": root}
     where = tmp_path / "scheduler.json"
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment}
@@ -232,7 +232,7 @@ synthesize_store(sys.argv[1], "checker", texels=int(sys.argv[4]), views=views, l
 def test_the_budget_is_kept(tmp_path, estimator, texels, spp, budget):
     """The budget bounds the process that does the work; 256² · 151² as a whole would be 17 GB."""
     out = tmp_path / "a.btf.zarr"
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[3])}
     child = subprocess.run(
         [sys.executable, "-c", CHILD, str(out), str(budget << 20), estimator, str(texels), str(spp)],
         capture_output=True, text=True, env=environment, check=True,
