@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from btfref.comparison import metrics, significance
 from btfref.comparison.colour import delta_e00
 from btfref.comparison.flip import exposure_range, flip_map
-from btfref.comparison.picture_gates import class_codes, judge_pictures
+from btfref.comparison.picture_gates import Rounding, class_codes, judge_pictures
 from btfref.conventions import PixelClass
 from btfref.errors import InputError
 from btfref.gates.tolerances import gate_table, limits, tolerance
@@ -132,6 +132,7 @@ def compare(
     variance: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
     display: Display | None = None,
     flip: bool = True,
+    rounding: Rounding | None = None,
 ) -> Comparison:
     """Compare two pictures of linear radiance.
 
@@ -150,6 +151,10 @@ def compare(
         For ΔE00 and SSIM; default `fit_display` of the reference.
     flip : bool, optional
         Whether to compute HDR-FLIP.
+    rounding : callable, optional
+        Pixels, bool (H, W) -> the most that the rounding of texture coordinates may move them by, (H, W, 3), such as
+        :func:`btfref.rendering.offline.rounding.rounding_of` gives. Asked for a few pixels, where the 99.9th percentile
+        of a gate with ``beyond_rounding`` is over its limit.
 
     Returns
     -------
@@ -232,7 +237,8 @@ def compare(
         classes,
         variance,
     )
-    gates = [result for key in ("image.finite", *keys) for result in judge_pictures(key, comparison, masks)]
+    every = ("image.finite", *keys)
+    gates = [result for key in every for result in judge_pictures(key, comparison, masks, rounding)]
     return replace(comparison, gates=tuple(dict.fromkeys(gates)))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -23,7 +23,19 @@ def class_codes() -> dict[str, int]:
     return {kind.label: kind.value for kind in PixelClass}
 
 
-def judge_pictures(key: str, comparison: Comparison, masks: Mapping[str, np.ndarray]) -> list[GateResult]:
+#: Pixels (H, W) → what rounding alone may move them by, (H, W, 3).
+Rounding = Callable[[np.ndarray], np.ndarray]
+
+#: Share of the judged pixels that may ask for it: where more are off, rounding is not why.
+ASKING = 0.1
+
+
+def judge_pictures(
+    key: str,
+    comparison: Comparison,
+    masks: Mapping[str, np.ndarray],
+    rounding: Rounding | None = None,
+) -> list[GateResult]:
     """Apply one gate to a comparison of pictures.
 
     Parameters
@@ -33,6 +45,8 @@ def judge_pictures(key: str, comparison: Comparison, masks: Mapping[str, np.ndar
     comparison : Comparison
     masks : dict of str to ndarray of bool, shape (H, W)
         Finite pixels of each class that has some.
+    rounding : callable, optional
+        What rounding alone may move some pixels by. It is asked where a gate with ``beyond_rounding`` fails.
 
     Returns
     -------
@@ -71,7 +85,11 @@ def judge_pictures(key: str, comparison: Comparison, masks: Mapping[str, np.ndar
         outcome = "empty" if table.get("may_be_empty") else "fail"
         detail = f"no finite {name} pixels"
         return judge(key, dict.fromkeys(wanted, Measured(None, outcome, detail)), pixel_class=name)
-    found = judge(key, {w: _measure(w, name, table, comparison, mask) for w in wanted}, pixel_class=name)
+    measured = {w: _measure(w, name, table, comparison, mask) for w in wanted}
+    if rounding is not None and "beyond_rounding" in table:
+        entry = str(table["beyond_rounding"])
+        measured[entry] = _beyond(entry, table, comparison, mask, rounding)
+    found = judge(key, measured, pixel_class=name)
     return [replace(gate, judged=share) for gate in found] if name not in ("all", "background") else found
 
 
@@ -106,6 +124,26 @@ def _measure(
         raise InputError("no such measure", file="tolerances.toml", field=entry, expected=sorted(known))
     # Of several classes together nothing is measured before a gate asks.
     return known[entry] if name in comparison.metrics else float(getattr(metrics, entry)(t, r))
+
+
+def _beyond(
+    entry: str, table: Gate, comparison: Comparison, mask: np.ndarray, rounding: Rounding
+) -> float | Measured:
+    """A percentile of the errors beyond what rounding accounts for, which is asked for where they exceed the limit."""
+    t, r = (picture[mask] for picture in comparison.pictures)
+    floor = float(table.get("floor", metrics.FLOOR))
+    error = metrics.relative_error(t, r, floor=floor)
+    plain, asking = metrics.percentiles(error)[entry], error > table[entry]
+    if plain <= table[entry] or np.mean(asking) > ASKING:
+        return plain
+    pixels = np.zeros_like(mask)
+    pixels[mask] = asking
+    excess = np.maximum(np.abs(t - r) - rounding(pixels)[mask], 0)
+    value = metrics.percentiles(metrics.relative_error(r + excess, r, floor=floor))[entry]
+    count = np.count_nonzero(asking)
+    return Measured(
+        value, None, f"{plain:.2e} before the rounding of uv, measured at {count} pixels, was taken off"
+    )
 
 
 def _equivalence(t: np.ndarray, r: np.ndarray, variance: np.ndarray, table: Gate) -> Measured:

@@ -28,6 +28,7 @@ PARAMETERS = (
     "class",
     "may_be_empty",
     "floor",
+    "beyond_rounding",
     "failing_above",
     "significance",
     "power",

@@ -143,6 +143,11 @@ class Hits:
         assert self._at is not None, "hits of no surface"
         return self._at
 
+    def moved(self, step: tuple[float, float]) -> Hits:
+        """The same hits, the shape's texture coordinates off by ``step``; directions and places stay."""
+        surface, at = self._surface, self._at
+        return Hits(self.material, self._uv + np.asarray(step), self._wi, self._hand, surface=surface, at=at)
+
     @cached_property
     def uv(self) -> JitArray:
         """Coordinates of the texture: the shape's, transformed."""

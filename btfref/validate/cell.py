@@ -197,6 +197,7 @@ def _save(path: Path, result: CellResult) -> None:
 
 
 def _cell(cache: Cache, spec: Spec, settings: Settings) -> CellResult:
+    from btfref.rendering.offline.rounding import rounding_of
     from btfref.representations.file.container import read_info
 
     start = time.perf_counter()
@@ -214,16 +215,21 @@ def _cell(cache: Cache, spec: Spec, settings: Settings) -> CellResult:
         Picture("8 bits", eight_bits(image.image, display)[None]),
     ]
     parts = [part(*each, display) for each in of_stages]
-    classes = _classes(path, spec, views, shared)
+    classes, rounding = _classes(path, spec, views, shared), rounding_of(path, **shared)
     browser = browser_picture(path, spec.lights, settings, shared)
     in_browser: list[GateResult] = []
     if browser is not None:
         seen = browser.image[counts], reference.image[counts]
         parts.append(part(TITLE, "real time", *seen, display, beside=True))
-        in_browser = browser_gates(browser.image, reference.image, classes)
+        in_browser = browser_gates(browser.image, reference.image, classes, rounding)
     found = waterfall(chain, counts, display, parts=parts)
     comparison = compare(
-        image.image, reference.image, classes=classes, gate=gates, variance=reference.variance
+        image.image,
+        reference.image,
+        classes=classes,
+        gate=gates,
+        variance=reference.variance,
+        rounding=rounding,
     )
     facts = {
         "name": spec.name,

@@ -20,6 +20,7 @@ from btfref.validate.cache import Cache, digest, key_of
 
 if TYPE_CHECKING:
     from btfref.comparison import Comparison
+    from btfref.comparison.picture_gates import Rounding
     from btfref.types import Facts, PathLike, Progress
 
 
@@ -47,12 +48,15 @@ class Reference:
         None where the reference has no noise.
     cached : bool
         Whether it was there already.
+    rounding : callable, optional
+        What the rounding of texture coordinates may move, for :func:`btfref.compare`; None with noise or shadows.
     """
 
     image: np.ndarray
     classes: np.ndarray
     variance: np.ndarray | None
     cached: bool = False
+    rounding: Rounding | None = None
 
 
 def reference_of(
@@ -95,6 +99,7 @@ def reference_of(
     InputError
         For a scene that cannot be read.
     """
+    from btfref.rendering.offline.rounding import rounding_of
     from btfref.representations.file.container import read_info
     from btfref.scene.description import read_scene
 
@@ -117,7 +122,9 @@ def reference_of(
     store = Cache(cache)
     with np.load(store.get(key_of({"reference": facts}), ".reference.npz", save)) as stored:
         variance = stored["variance"] if "variance" in stored.files else None
-        return Reference(stored["image"], stored["classes"], variance, not store.computed)
+        plain = facts["delta"] and not shadows
+        rounding = rounding_of(path, parameters=parameters, size=size, grid=grid) if plain else None
+        return Reference(stored["image"], stored["classes"], variance, not store.computed, rounding)
 
 
 def _render(
@@ -188,7 +195,13 @@ def judge_image(
         gates = NOISY if reference.variance is not None else EIGHT_BIT if eight_bit else LINEAR
     expected = np.clip(reference.image, 0, 1) if eight_bit else reference.image
     return compare(
-        test, expected, classes=reference.classes, gate=gates, variance=reference.variance, flip=flip
+        test,
+        expected,
+        classes=reference.classes,
+        gate=gates,
+        variance=reference.variance,
+        flip=flip,
+        rounding=reference.rounding,
     )
 
 

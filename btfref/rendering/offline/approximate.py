@@ -109,12 +109,12 @@ def approximate(
                 if mesh.material is None and mesh.plain is not None:
                     rep = mesh.plain.representation
                     light = None if lighting is None else lighting.of_plain.prepared(rep)
-                    total[hits.at] += _radiance(rep, hits, mesh, description, grid, light)
+                    total[hits.at] += radiance(rep, hits, mesh, description, grid, light)
                     continue
                 name = mesh.btf.filename
                 if name not in reps:
                     reps[name] = (load_file or representations.load)(name)
-                rep = _filtered(reps[name], mesh.btf.filter_type)
+                rep = filtered(reps[name], mesh.btf.filter_type)
                 light = None
                 if lighting is not None:
                     key = (name, number) if lighting.per_mesh else name
@@ -125,13 +125,13 @@ def approximate(
                 if mesh.btf.interpolation == "drawn" and isinstance(rep, DrawsViews):
                     numbers = [place + k * grid**2 for k in range(rounds)]
                     draws = [of_pixels(camera.height, camera.width, k, seed).ravel() for k in numbers]
-                    values = np.stack([_radiance(*settings, draw[hits.at]) for draw in draws])
+                    values = np.stack([radiance(*settings, draw[hits.at]) for draw in draws])
                     value = values.mean(0)
                     if rounds > 1:
                         # Places draw apart from each other.
                         noise[hits.at] += mesh.btf.scale**2 * values.var(0, ddof=1) / rounds
                 else:
-                    value = _radiance(*settings)
+                    value = radiance(*settings)
                 total[hits.at] += mesh.btf.scale * value
     image = (total / grid**2).reshape(camera.height, camera.width, 3)
     facts = [{"environment_path": p.path, **p.facts} for p in prepared.values()]
@@ -151,7 +151,7 @@ def approximate(
     return RenderResult(image.astype(np.float32), variance, meta)
 
 
-def _filtered(representation: Representation, filter_type: str | None) -> Representation:
+def filtered(representation: Representation, filter_type: str | None) -> Representation:
     """The representation with the material's texel filter."""
     if filter_type in (None, representation.meta["filter_type"]):
         return representation
@@ -159,7 +159,7 @@ def _filtered(representation: Representation, filter_type: str | None) -> Repres
     return type(representation).from_arrays(representation.arrays(), meta)
 
 
-def _radiance(
+def radiance(
     representation: Representation,
     hits: Hits,
     mesh: MeshDescription,

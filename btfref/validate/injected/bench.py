@@ -32,6 +32,7 @@ from btfref.validate.own_renderer import EIGHT_BIT, NOISY
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+    from btfref.comparison.picture_gates import Rounding
     from btfref.rendering import RenderResult
     from btfref.representations.protocol import Representation
     from btfref.sampling import SampledBTF
@@ -183,6 +184,13 @@ class Bench:
             self._references[subject] = scene, parameters, image, classes
         return self._references[subject]
 
+    def rounding(self, subject: Subject) -> Rounding:
+        """What the rounding of texture coordinates may move, as cells of the matrix ask for it."""
+        from btfref.rendering.offline.rounding import rounding_of
+
+        scene, parameters, _, _ = self.reference(subject)
+        return rounding_of(scene, parameters=parameters, **SETTINGS)
+
     def picture(self, subject: Subject, change: str = "") -> Gates:
         """Real time against the reference; the fault without a shader is light where nothing is."""
         from btfref.rendering.gl.realtime import realtime
@@ -193,7 +201,8 @@ class Bench:
             classes = np.where(np.indices(classes.shape).sum(0) % 4 == 0, PixelClass.SILHOUETTE, classes)
         if change == "background":
             image = np.where(classes[..., None] == PixelClass.BACKGROUND, image + 0.01, image)
-        return compare(image, expected, classes=classes, gate=GATES, flip=False).gates
+        rounding = self.rounding(subject)
+        return compare(image, expected, classes=classes, gate=GATES, flip=False, rounding=rounding).gates
 
     def shadows(self, subject: Subject) -> Gates:
         """Real time with cast shadows against the reference with its own."""
@@ -218,7 +227,7 @@ class Bench:
 
         scene, parameters, expected, classes = self.reference(subject)
         image = webgl(scene, parameters=parameters, shadows=False, **SETTINGS).image
-        return browser_gates(image, expected, classes)
+        return browser_gates(image, expected, classes, self.rounding(subject))
 
     def browser_environment(self, subject: Subject) -> Gates:
         """Real time under an environment in a browser against float64."""

@@ -21,6 +21,7 @@ from btfref.errors import MissingDependencyError
 from btfref.system import CHROMIUM, chromium, mend_command
 
 if TYPE_CHECKING:
+    from btfref.comparison.picture_gates import Rounding
     from btfref.gates.verdicts import GateResult
     from btfref.rendering import RenderResult
     from btfref.representations.protocol import Representation
@@ -170,7 +171,11 @@ def browser_classes(classes: np.ndarray) -> np.ndarray:
     return np.where(near & (classes == PixelClass.BACKGROUND), np.uint8(PixelClass.SILHOUETTE), classes)
 
 
-def browser_gates(image: np.ndarray, reference: np.ndarray, classes: np.ndarray) -> list[GateResult]:
-    """Its gates, which say whose they are."""
-    found = compare(image, reference, classes=browser_classes(classes), gate=GATES, flip=False)
+def browser_gates(
+    image: np.ndarray, reference: np.ndarray, classes: np.ndarray, rounding: Rounding | None = None
+) -> list[GateResult]:
+    """Its gates, which say whose they are; ``rounding`` as for :func:`btfref.compare`."""
+    found = compare(
+        image, reference, classes=browser_classes(classes), gate=GATES, flip=False, rounding=rounding
+    )
     return [gate.named(TITLE) for gate in found.gates]
