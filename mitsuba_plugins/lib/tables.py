@@ -79,17 +79,13 @@ class PairTable:
         self.outer, self.n_views, self.n_lights, self.width = values.shape
         self.words, self.values = None, None
         halves = values.numpy() if dr.type_v(values.array) == dr.VarType.Float16 else None
-        # Moved bits make a number of NaN, which stands for what is not there: such tables stay as they are.
-        if halves is None or not np.abs(halves).max() <= HALF_LIMIT:
+        words = None if halves is None else _words(halves.view(np.uint16), self.following)
+        if words is None:
             self.values = as_float32(values)
             return
-        halves = (halves * np.float16(HALF_SHIFT)).view(np.uint16)
-        if self.following is None:
-            words = np.ascontiguousarray(halves).view(np.uint32)
-        else:
-            words = halves[..., self.following, :].astype(np.uint32) << 16
-            words |= halves
-        self.words = dr.reinterpret_array(mi.Float, to_device(mi.UInt32, words))
+        shared = words.nbytes > SHARED_ABOVE
+        numbers = mi.UInt32(words.ravel()) if shared else to_device(mi.UInt32, words)
+        self.words = dr.reinterpret_array(mi.Float, numbers)
         dr.eval(self.words)
 
     @property
@@ -193,6 +189,44 @@ class PairTable:
             for word in read_packets(self.words, entry, self.width // 2, active)
             for half in widened(word)
         ]
+
+
+#: Bits of each half × ``HALF_SHIFT``, by its own; what overflows is not asked for.
+with np.errstate(over="ignore", invalid="ignore"):
+    _SHIFTED = (np.arange(1 << 16, dtype=np.uint16).view(np.float16) * np.float16(HALF_SHIFT)).view(np.uint16)
+
+#: Rows of lights that are packed at a time: they stay in the processor's caches.
+_TOGETHER = 512
+
+
+def _words(halves: np.ndarray, following: np.ndarray | None) -> np.ndarray | None:
+    """Pairs of halves that were multiplied, by their bits; None where one is too large, or no number.
+
+    Parameters
+    ----------
+    halves : ndarray of uint16, shape (outer, n_views, n_lights, width)
+    following : ndarray of int, shape (n_lights,), or None
+        See `PairTable`.
+    """
+    _, _, lights, width = halves.shape
+    rows = halves.reshape(-1, lights, width)
+    words = np.empty((len(rows), lights, width if following is not None else width // 2), np.uint32)
+    most = np.float16(HALF_LIMIT).view(np.uint16)
+    entry = np.dtype((np.void, 2 * width))
+    for start in range(0, len(rows), _TOGETHER):
+        part = slice(start, start + _TOGETHER)
+        # Moved bits make a number of NaN, which stands for what is not there: such tables stay as they are.
+        if (rows[part] & 0x7FFF).max() > most:
+            return None
+        low = np.take(_SHIFTED, rows[part])
+        if following is None:
+            words[part] = low.view(np.uint32)
+        else:
+            high = np.take(low.view(entry)[..., 0], following, axis=1)
+            words[part] = high[..., None].view(np.uint16)
+            words[part] <<= 16
+            words[part] |= low
+    return words
 
 
 def widened(word: JitArray) -> tuple[JitArray, JitArray]:
