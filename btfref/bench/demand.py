@@ -77,6 +77,7 @@ def run(options: Options) -> Facts:
         of it, and frame time; ``raw``;
         ``parameters``; ``machine``.
     """
+    options.demand((*ESTIMATORS, "scenes"))
     tell = options.tell
     result = {"suite": "demand", "parameters": {"quick": options.quick}, "machine": machine()}
     with tempfile.TemporaryDirectory() as folder:

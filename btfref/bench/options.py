@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+
+from btfref.errors import InputError
 
 if TYPE_CHECKING:
     from btfref.sampling import SampledBTF
@@ -43,3 +45,17 @@ class Options:
     def wants(self, name: str) -> bool:
         """Whether a part of the suite is asked for."""
         return self.only is None or name in self.only
+
+    def demand(self, names: Iterable[str]) -> None:
+        """Say what the suite goes through.
+
+        Raises
+        ------
+        InputError
+            For a name in ``only`` that is not among them.
+        """
+        known = list(names)
+        if unknown := [name for name in self.only or () if name not in known]:
+            raise InputError(
+                "nothing of that name", field="--only", got=", ".join(unknown), expected=", ".join(known)
+            )

@@ -28,7 +28,6 @@ from btfref.bench.data import MESOSTRUCTURES
 from btfref.bench.options import Options
 from btfref.bench.synth_methods import MAX_DEPTH, NAIVE_PAIRS, PAIRS, PATH_VIEWS, REFERENCE_SPP
 from btfref.bench.timing import machine
-from btfref.errors import InputError
 
 if TYPE_CHECKING:
     from btfref.types import Facts, Progress
@@ -83,9 +82,7 @@ def run(options: Options) -> Facts:
         For a name in ``only`` that there is not.
     """
     names = list(options.only or (*(MESOSTRUCTURES[:1] if options.quick else MESOSTRUCTURES), "growth"))
-    for name in set(names) - {*MESOSTRUCTURES, "growth"}:
-        known = ", ".join((*MESOSTRUCTURES, "growth"))
-        raise InputError("no such mesostructure", field="--only", got=name, expected=known)
+    options.demand((*MESOSTRUCTURES, "growth"))
     settings = _growing(options.quick) if "growth" in names else []
     names = [name for name in names if name != "growth"]
     rounds, texels = (1, 16) if options.quick else (3, 64)

@@ -15,7 +15,6 @@ import numpy as np
 from btfref.bench.data import MESOSTRUCTURES, material_name
 from btfref.bench.options import Options
 from btfref.bench.timing import machine
-from btfref.errors import InputError
 from btfref.registry import methods
 
 if TYPE_CHECKING:
@@ -90,9 +89,7 @@ def chosen_of(axes: Sequence[Sequence[str]], options: Options) -> list[Sequence[
     InputError
         For a name that is on no axis.
     """
-    known = {name for axis in axes for name in axis}
-    if unknown := [name for name in options.only or () if name not in known]:
-        raise InputError("nothing of that name", field="--only", got=", ".join(unknown))
+    options.demand(dict.fromkeys(name for axis in axes for name in axis))
     return [[name for name in axis if name in (options.only or ())] or axis for axis in axes]
 
 

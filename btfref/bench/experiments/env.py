@@ -54,12 +54,18 @@ def run(options: Options) -> Facts:
     -------
     dict
         ``summary``: by table, rows of numbers; ``raw``: times; ``machine``.
+
+    Raises
+    ------
+    InputError
+        For a name in ``only`` that there is not.
     """
     from btfref.bench.data import checker
     from btfref.registry import methods
     from btfref.representations import save
 
     parts = {"prefiltered": _prefiltered, "order": _order, "transfer": _transfer, "time": _time}
+    options.demand(parts)
     btf = options.btf or checker(texels=32, spp=8, progress=options.progress)
     summary, raw = {}, {}
     with tempfile.TemporaryDirectory() as folder:

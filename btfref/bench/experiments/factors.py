@@ -16,7 +16,6 @@ import numpy as np
 from btfref.bench.data import MESOSTRUCTURES, material_name, materials
 from btfref.bench.options import Options
 from btfref.bench.timing import machine
-from btfref.errors import InputError
 
 if TYPE_CHECKING:
     from btfref.representations.factored.definition import Representation
@@ -71,11 +70,8 @@ def run(options: Options) -> Facts:
     from btfref.representations.factored.storage import cluster
     from btfref.sampling.synthesis import synthesize
 
-    variants = {name: v for name, v in VARIANTS.items() if not options.only or v[0] in options.only}
-    if not variants:
-        raise InputError(
-            "nothing to measure", field="--only", got=", ".join(options.only or ()), expected="cmf or hf"
-        )
+    options.demand(dict.fromkeys(key for key, *_ in VARIANTS.values()))
+    variants = {name: v for name, v in VARIANTS.items() if options.wants(v[0])}
     report = options.tell
     timed = options.btf or synthesize(
         "checker",

@@ -40,7 +40,7 @@ def run(options: Options) -> Facts:
     ----------
     options : Options
         ``quick``: the smaller size only. ``btf``: instead of the checkers; heights are compared with the truth for
-        checkers alone. ``only``: ignored: there is one method. ``report``: HTML page with the maps, where the truth
+        checkers alone. ``only``: "gbrdf": there is one method. ``report``: HTML page with the maps, where the truth
         is known.
 
     Returns
@@ -53,6 +53,7 @@ def run(options: Options) -> Facts:
     """
     from btfref.sampling.synthesis import synthesize
 
+    options.demand(("gbrdf",))
     if options.btf is not None:
         cases = [options.btf]
     else:

@@ -53,6 +53,7 @@ def run(options: Options) -> Facts:
     from btfref.registry import method
     from btfref.representations import save
 
+    options.demand(METHODS)
     methods = [key for key in METHODS if options.wants(key)]
     texels, rounds = ROUNDS if options.quick else SIZE
     shares = SHARES[:3] if options.quick else SHARES

@@ -55,6 +55,7 @@ def run(options: Options) -> Facts:
     from btfref.representations.analytic import rf_lobes
     from btfref.representations.analytic.lobe_start import lobe_starts
 
+    options.demand(PEERS)
     btf = options.btf or checker(spp=8, progress=options.progress)
     lights = btf.lights.vectors
     data = residual_fields(btf)

@@ -61,6 +61,7 @@ def run(options: Options) -> Facts:
     from btfref.registry import method
     from btfref.representations import save
 
+    options.demand((*MOVES, "cost"))
     btf = options.btf or checker(spp=16, progress=options.progress)
     tell = options.tell
     frames, grid = (2, 12) if options.quick else (FRAMES, TRUTH)

@@ -57,6 +57,7 @@ def run(options: Options) -> Facts:
     from btfref.registry import methods
     from btfref.representations import save
 
+    options.demand(methods())
     btf = options.btf or checker(spp=8, progress=options.progress)
     mi = mitsuba_plugins.ready()
     raw, result = {}, {}

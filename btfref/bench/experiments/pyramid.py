@@ -45,6 +45,7 @@ def run(options: Options) -> Facts:
     """
     from btfref.representations.laplacian import definition as laplacian
 
+    options.demand(MESOSTRUCTURES)
     names = options.only or (MESOSTRUCTURES[:1] if options.quick else MESOSTRUCTURES)
     paper: Facts = laplacian.PRESETS["paper"]
     summary: Facts = {}

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 from btfref.bench.options import Options
 from btfref.bench.timing import machine
 from btfref.conventions import FILTER_TYPES
-from btfref.errors import InputError
 from btfref.registry import methods
 from btfref.stress.data import bumpy
 from btfref.stress.gradients import STEPS
@@ -61,8 +60,7 @@ def run(options: Options) -> Facts:
     from btfref.representations import save
     from btfref.stress.gradients import SIZE, SPP, STEP
 
-    if unknown := [name for name in options.only or () if name not in methods()]:
-        raise InputError("nothing of that name", field="--only", got=", ".join(unknown))
+    options.demand(methods())
     btf = options.btf or bumpy(0, TEXELS)
     keys = [key for key in methods() if options.wants(key)]
     summary: Facts = {}

@@ -131,12 +131,6 @@ def test_a_process_that_fails_says_why():
             process.answer()
 
 
-def test_an_unknown_name_is_refused():
-    with pytest.raises(InputError) as error:
-        synth.run(Options(only=["chess"]))
-    assert error.value.field == "--only"
-
-
 def test_the_growth_is_drawn_and_a_plot_without_it_refused(need, tmp_path, capsys):
     need("matplotlib")
     sizes = {"5x5": 25, "ubo81": 81, "ubo151": 151}
