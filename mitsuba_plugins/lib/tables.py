@@ -210,7 +210,7 @@ def _words(halves: np.ndarray, following: np.ndarray | None) -> np.ndarray | Non
     """
     _, _, lights, width = halves.shape
     rows = halves.reshape(-1, lights, width)
-    words = np.empty((len(rows), lights, width if following is not None else width // 2), np.uint32)
+    words = np.zeros((len(rows), lights, width if following is not None else width // 2), np.uint32)
     most = np.float16(HALF_LIMIT).view(np.uint16)
     entry = np.dtype((np.void, 2 * width))
     for start in range(0, len(rows), _TOGETHER):

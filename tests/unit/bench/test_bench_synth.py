@@ -5,9 +5,7 @@ import pytest
 from PIL import Image
 
 from btfref.bench import synth, synth_methods
-from btfref.bench.options import Options
 from btfref.cli import main
-from btfref.errors import InputError
 from btfref.gates import tolerance
 from btfref.report.growth_plot import plot_growth
 
