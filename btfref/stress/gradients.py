@@ -32,7 +32,10 @@ LEAST = 0.01
 
 #: Steps of Adam, how far a map is moved away before them, relative to its root mean square, and the rate of the first
 #: one, relative to that.
-STEPS, AWAY, FIRST_RATE = 20, 0.3, 0.25
+STEPS, AWAY, FIRST_RATE = 20, 0.3, 0.4
+
+#: What its means of gradients and of their squares keep from step to step: twenty steps are few for 0.9 and 0.999.
+KEPT = 0.7, 0.95
 
 #: The gate.
 GATE = "gradient.maps"
@@ -138,7 +141,7 @@ class Subject:
         target = self._picture()
         size = AWAY * float(np.sqrt((np.array(start, float) ** 2).mean()))
         sign = np.random.default_rng(1).choice([-size, size], start.shape).astype(np.float32)
-        optimizer = mi.ad.Adam(lr=size)
+        optimizer = mi.ad.Adam(lr=size, beta_1=KEPT[0], beta_2=KEPT[1])
         optimizer[key] = start + type(start)(sign)
         self.parameters.update(optimizer)
         before = _rmse(self._picture(), target)

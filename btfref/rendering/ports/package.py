@@ -207,8 +207,13 @@ class PortPackage:
             "conventions": CONVENTIONS,
         }
 
-    def embedded(self) -> Facts:
+    def embedded(self, *, data: bool = True) -> Facts:
         """The whole package as one JSON-able dict, for a page that stands alone.
+
+        Parameters
+        ----------
+        data : bool
+            Whether the textures' bytes are there.
 
         Returns
         -------
@@ -219,7 +224,8 @@ class PortPackage:
         layout["shader"]["text"] = self.shader
         for entry, texture in zip(layout["textures"], self.textures, strict=True):
             del entry["file"]
-            entry["base64"] = base64.b64encode(texture.data).decode("ascii")
+            if data:
+                entry["base64"] = base64.b64encode(texture.data).decode("ascii")
         return layout
 
     def write(self, folder: PathLike) -> None:

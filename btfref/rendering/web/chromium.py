@@ -64,6 +64,11 @@ class Browser:
     timeout : float
         Seconds that one answer may take.
 
+    Attributes
+    ----------
+    profile : str
+        Folder of its own, which goes when it ends.
+
     Raises
     ------
     MissingDependencyError
@@ -83,14 +88,14 @@ class Browser:
         #: Whether an answer did not come in time: nobody knows what it is at.
         self.silent = False
         self._crashed: set[str | None] = set()
-        self._profile = tempfile.mkdtemp(prefix="btfref-chromium-")
+        self.profile = tempfile.mkdtemp(prefix="btfref-chromium-")
         ours, theirs = _pipe(), _pipe()
         try:
             self._process = subprocess.Popen(
                 [
                     *(sys.executable, "-I", "-S", "-c", _START, str(ours[0]), str(theirs[1]), program),
                     *FLAGS,
-                    f"--user-data-dir={self._profile}",
+                    f"--user-data-dir={self.profile}",
                     *flags,
                     "about:blank",
                 ],
@@ -135,7 +140,7 @@ class Browser:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        shutil.rmtree(self._profile, ignore_errors=True)
+        shutil.rmtree(self.profile, ignore_errors=True)
 
     def send(self, method: str, parameters: Facts | None = None, session: str | None = None) -> Facts:
         """One command of the protocol, and its answer; events that come meanwhile are kept in ``events``.
@@ -304,6 +309,40 @@ class Page:
         for first in range(0, len(text), PIECE):
             self.evaluate(f"{name}.push({json.dumps(text[first : first + PIECE])}); 0")
         return f"JSON.parse({name}.splice(0).join(''))"
+
+    def taken(self, data: bytes | memoryview) -> str:
+        """Give the page bytes of any size, by way of a file that it opens: text of them would take many times as long.
+
+        Parameters
+        ----------
+        data : bytes-like
+
+        Returns
+        -------
+        str
+            An expression for a ``Uint8Array`` of them, to be evaluated once.
+
+        Raises
+        ------
+        BtfrefError
+        """
+        self._given += 1
+        name = f"btfrefGiven{self._given}"
+        made = "Object.assign(document.createElement('input'), { type: 'file' })"
+        found = self.send("Runtime.evaluate", {"expression": made})["result"]["objectId"]
+        read = (
+            "async function (name) { globalThis[name] = new Uint8Array(await this.files[0].arrayBuffer()); }"
+        )
+        with tempfile.NamedTemporaryFile(dir=self.browser.profile) as file:
+            file.write(data)
+            file.flush()
+            self.send("DOM.setFileInputFiles", {"files": [file.name], "objectId": found})
+            asked = {"objectId": found, "functionDeclaration": read, "arguments": [{"value": name}]}
+            answer = self.send("Runtime.callFunctionOn", {**asked, "awaitPromise": True})
+        if "exceptionDetails" in answer:
+            raise BtfrefError(f"the browser cannot read what it is given: {len(data)} bytes")
+        self.send("Runtime.releaseObject", {"objectId": found})
+        return f"(() => {{ const bytes = {name}; delete globalThis.{name}; return bytes; }})()"
 
     def complaints(self) -> list[str]:
         """Errors and warnings of this page so far: of its console, of exceptions, of the browser's log."""

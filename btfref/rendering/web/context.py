@@ -53,7 +53,9 @@ class WebContext:
         names = json.dumps(EXTENSIONS)
         self._page.evaluate(f"globalThis.gl = BtfPort.connect(new OffscreenCanvas(1, 1), {names}); 0")
         text = files(__package__).joinpath("webgl.js").read_text("utf-8")
-        self._page.evaluate(f"{text}; globalThis.run = BtfGl.renderer(gl); 0")
+        self._page.evaluate(
+            f"{text}; globalThis.given = new Map(); globalThis.run = BtfGl.renderer(gl, given); 0"
+        )
         asked = (
             "['MAX_RENDERBUFFER_SIZE', 'MAX_ARRAY_TEXTURE_LAYERS', 'MAX_TEXTURE_SIZE', 'VENDOR', 'VERSION']"
         )
@@ -71,6 +73,10 @@ class WebContext:
         self.add(name, *arguments)
         commands, self._commands = self._commands, []
         return self._page.evaluate(f"run({self._page.given(commands)})")
+
+    def give(self, number: int, data: memoryview | bytes) -> None:
+        """The data of a thing to come."""
+        self._page.evaluate(f"given.set({number}, {self._page.taken(data)}); 0")
 
     def number(self) -> int:
         """A name for a new object."""
@@ -155,8 +161,9 @@ class _Texture(_Thing):
     ) -> None:
         super().__init__(context)
         self.size, self.filter = tuple(size), ("NEAREST", "NEAREST")
-        text = None if data is None else base64.b64encode(bytes(data)).decode("ascii")
-        context.add("texture", self.id, target, list(size), components, dtype, text)
+        if data is not None:
+            context.give(self.id, data)
+        context.add("texture", self.id, target, list(size), components, dtype, data is not None)
 
     def use(self, unit: int) -> None:
         self.context.add("bind", self.id, unit)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -96,7 +98,13 @@ class WebProbe:
         self._own = where is None
         self._device = device() if where is None else where
         text = base64.b64encode(np.ascontiguousarray(rows, "<f4").tobytes()).decode("ascii")
-        self._do("globalThis.port = BtfPort.open(gl, {}); 0", package.embedded())
+        with self._alive():
+            taken = [self._device.page.taken(texture.data) for texture in package.textures]
+        self._do(
+            f"globalThis.port = (() => {{ const bytes = [{', '.join(taken)}];"
+            " return BtfPort.open(gl, {}, () => bytes.shift()); })(); 0",
+            package.embedded(data=False),
+        )
         self._do(
             "globalThis.lookups = BtfPort.prepare(gl, port, new Float32Array(BtfPort.decode({}).buffer)); 0",
             text,
@@ -112,10 +120,16 @@ class WebProbe:
     def _do(self, expression: str, value: object = None) -> Facts:
         """The value of an expression; a pair of braces in it stands for a value."""
         page = self._device.page
-        try:
+        with self._alive():
             if value is not None:
                 expression = expression.replace("{}", page.given(value), 1)
             return page.evaluate(expression)
+
+    @contextmanager
+    def _alive(self) -> Iterator[None]:
+        """After an error the process's own device is another one."""
+        try:
+            yield
         except BtfrefError:
             if self._own:
                 _kept().clear()

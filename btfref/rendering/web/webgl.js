@@ -13,13 +13,14 @@ const BtfGl = (() => {
     FLOAT_MAT4: "uniformMatrix4fv", INT_VEC2: "uniform2iv", INT_VEC3: "uniform3iv", INT_VEC4: "uniform4iv",
   };
 
-  function renderer(gl) {
+  // What is given: the bytes of textures to come, by their numbers.
+  function renderer(gl, given) {
     const things = new Map();
     const of = (id) => things.get(id);
     const setters = Object.fromEntries(Object.entries(SET).map(([type, name]) => [gl[type], name]));
 
     const calls = {
-      texture(id, target, size, components, dtype, data) {
+      texture(id, target, size, components, dtype, filled) {
         const [internal, format, type, Kind] = FORMATS[`${dtype} ${components}`], made = gl.createTexture(), where = gl[target];
         gl.activeTexture(gl.TEXTURE0);
         gl.bindTexture(where, made);
@@ -27,8 +28,9 @@ const BtfGl = (() => {
         const flat = target === "TEXTURE_2D";
         if (flat) gl.texStorage2D(where, 1, gl[internal], ...size);
         else gl.texStorage3D(where, 1, gl[internal], ...size);
-        if (data !== null) {
-          const values = new Kind(BtfPort.decode(data).buffer);
+        if (filled) {
+          const values = new Kind(given.get(id).buffer);
+          given.delete(id);
           if (flat) gl.texSubImage2D(where, 0, 0, 0, ...size, gl[format], gl[type], values);
           else gl.texSubImage3D(where, 0, 0, 0, 0, ...size, gl[format], gl[type], values);
         }

@@ -169,6 +169,20 @@ def test_what_is_long_is_said_in_pieces(browser, asked, monkeypatch):
         assert page.evaluate(f"({other})") == text[:1]
 
 
+def test_bytes_go_by_a_file(browser, rng):
+    """Whatever they are, and once: the page does not keep them."""
+    with browser.page() as page:
+        for data in (rng.bytes(3 << 20), b"", memoryview(np.arange(5, dtype=np.float32)).cast("B")):
+            given = page.taken(data)
+            told = f"{given}.reduce((sum, x, i) => (sum * 31 + x) % 65521, 7)"
+            expected = 7
+            for x in bytes(data):
+                expected = (expected * 31 + x) % 65521
+            assert page.evaluate(told) == expected
+            with pytest.raises(BtfrefError, match="not defined"):
+                page.evaluate(told)
+
+
 def test_no_message_makes_the_browser_deaf(browser, monkeypatch):
     monkeypatch.setattr(chromium, "LONGEST", 10_000)
     with browser.page() as page:
