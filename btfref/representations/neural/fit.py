@@ -327,7 +327,8 @@ def _slope(y: np.ndarray, targets: np.ndarray, cosine: np.ndarray, scale: np.nda
     slope *= np.float32(math.log(2) / y.size)
     # Held exponents are led back, never further away.
     out = ((y < network.LOWEST) & (slope > 0)) | ((y > network.HIGHEST) & (slope < 0))
-    return np.where(out, np.float32(0), slope)
+    slope *= ~out
+    return slope
 
 
 def _judged(samples: Samples, maps: dict[str, np.ndarray]) -> Facts:

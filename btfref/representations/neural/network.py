@@ -62,6 +62,18 @@ def rectified(x: np.ndarray) -> np.ndarray:
     return np.maximum(x, x * x.dtype.type(SLOPE))
 
 
+def _rectify_slope(by_x: np.ndarray, x: np.ndarray) -> None:
+    """Multiply a derivative by that of :func:`rectified`, of which ``x`` is the result; both are powers of two."""
+    slope = (x > 0) * x.dtype.type(1 - SLOPE)
+    slope += x.dtype.type(SLOPE)
+    by_x *= slope
+
+
+def _over_pairs(items: np.ndarray) -> np.ndarray:
+    """Sum of (T, P, n) over the pairs; a product with ones, which adds whole rows at once."""
+    return (np.ones((1, items.shape[1]), items.dtype) @ items)[:, 0]
+
+
 def exponents(latent: np.ndarray, codes: np.ndarray, layers: Mapping[str, np.ndarray]) -> np.ndarray:
     """Logarithms to base 2 of B over its scale and the light's cosine, not yet held.
 
@@ -148,17 +160,17 @@ def backward(
     layers : dict of str to ndarray
     """
     gain_1, _, gain_2, _, _ = split(tape.latent)
-    shape, one = tape.x_1.shape, slope.dtype.type
+    shape = tape.x_1.shape
     found, flat = {}, slope.reshape(-1, 3)
     found["layer_3"] = tape.x_2.reshape(-1, shape[2]).T @ flat
     by_x = (flat @ layers["layer_3"].T).reshape(shape)
-    by_x *= np.where(tape.x_2 > 0, one(1), one(SLOPE))
-    parts = [slope.sum(1), by_x.sum(1), np.einsum("tph,tph->th", by_x, tape.second)]
+    _rectify_slope(by_x, tape.x_2)
+    parts = [_over_pairs(slope), _over_pairs(by_x), np.einsum("tph,tph->th", by_x, tape.second)]
     by_x *= gain_2[:, None]
     flat = by_x.reshape(-1, shape[2])
     found["layer_2"] = tape.x_1.reshape(-1, shape[2]).T @ flat
     by_x = (flat @ layers["layer_2"].T).reshape(shape)
-    by_x *= np.where(tape.x_1 > 0, one(1), one(SLOPE))
-    parts += [by_x.sum(1), np.einsum("tph,ph->th", by_x, tape.first)]
+    _rectify_slope(by_x, tape.x_1)
+    parts += [_over_pairs(by_x), np.einsum("tph,ph->th", by_x, tape.first)]
     found["layer_1"] = tape.codes.T @ np.einsum("tph,th->ph", by_x, gain_1)
     return np.concatenate(parts[::-1], -1), found
