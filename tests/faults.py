@@ -239,7 +239,7 @@ ROWS = [
     ),
     Row(
         "workers",
-        "a method that needs the whole",
+        "a method whose steps follow each other",
         "fit neural good.btf.zarr -o out.exr --scheduler dask",
         ("scheduler",),
     ),

@@ -132,6 +132,8 @@ def fitted_by(
         return
     if not stated(method).streams:
         raise InputError("the method needs the whole BTF in one process", field="scheduler", got=method.key)
+    if stated(method).sequential:
+        raise InputError("the method's steps follow each other", field="scheduler", got=method.key)
     from btfref.sampling.passes import distributed_btf
 
     check_budget(method, store, budget, parameters)

@@ -348,6 +348,8 @@ class FitMemory:
         Further tables, whatever the parameters are.
     texel, field : float
         Bytes per texel, and per texel and view.
+    sequential : bool
+        Its steps follow each other, so that workers have nothing to do side by side.
     """
 
     each: float = 0.0
@@ -360,6 +362,7 @@ class FitMemory:
     columns: int = 0
     texel: float = 0.0
     field: float = 0.0
+    sequential: bool = False
 
     @property
     def streams(self) -> bool:

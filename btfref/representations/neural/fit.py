@@ -2,7 +2,8 @@
 
 Each step sees some neighbouring texels, moved by a random part of a texel, under some pairs of directions: texels times
 pairs, so that the first layer's products with directions are made once for all texels. The data are interpolated as the
-latent texture is: what is between texels is fitted as well.
+latent texture is: what is between texels is fitted as well. A BTF of many texels is read by bands of rows, see
+:mod:`btfref.representations.neural.samples`.
 """
 
 from __future__ import annotations
@@ -16,30 +17,31 @@ import numpy as np
 from btfref.errors import InputError
 from btfref.numerics.solvers.threads import reproducible
 from btfref.representations.analytic.light_functions import edge_constants
-from btfref.representations.file.schema import LARGEST
 from btfref.representations.lookup import (
     base_meta,
     direction_arrays,
     positive_integer,
-    refuse_not_finite,
     stored,
 )
 from btfref.representations.neural import network
 from btfref.representations.neural.definition import Representation
+from btfref.representations.neural.samples import ROW_BYTES, SIDE, TEXELS, Samples, a_window
 from btfref.representations.protocol import FitMemory
 
 if TYPE_CHECKING:
-    from btfref.sampling.sampled_btf import SampledBTF
+    from btfref.sampling.blocks import BTFBlocks
     from btfref.types import Facts, Progress
 
 #: See :mod:`btfref.representations.fit_memory`.
-FIT_MEMORY = FitMemory(2.4, 200 << 20)
+FIT_MEMORY = FitMemory(
+    blocks=200 << 20, scales=("hidden",), rows=ROW_BYTES, texels=TEXELS, texel=2400, sequential=True
+)
 
 #: "paper": all numbers in floats. "quick": a few steps, to try things out.
 PRESETS: dict[str, Facts] = {"paper": {"storage": "float"}, "quick": {"hidden": 16, "passes": 2}}
 
-#: Texels a side of a step, at most, and pairs of directions; few texels see more pairs, so that a step is worth it.
-SIDE, PAIRS, MOST_PAIRS = 8, 32, 128
+#: Pairs of directions of a step; few texels see more pairs, so that a step is worth it.
+PAIRS, MOST_PAIRS = 32, 128
 
 #: Lookups of a step, at least.
 BATCH = 2048
@@ -84,82 +86,9 @@ class Adam:
         self.value[at] -= size.astype(np.float32) * mean / (np.sqrt(square) + np.float32(1e-12))
 
 
-@dataclass(frozen=True)
-class Samples:
-    """What steps read: values by pair of directions, row and column, and what is known of the pairs."""
-
-    values: np.ndarray
-    codes: np.ndarray
-    cosine: np.ndarray
-    scale: np.ndarray
-    bilinear: bool
-
-    @property
-    def texels(self) -> tuple[int, int]:
-        """Rows and columns."""
-        return self.values.shape[1], self.values.shape[2]
-
-
-@dataclass(frozen=True)
-class Window:
-    """Neighbouring texels, wrapped, and how far they are moved.
-
-    Attributes
-    ----------
-    rows, columns : ndarray of int
-        One more than there are lookups a side.
-    way : (float, float)
-        Down and to the right, parts of a texel.
-    """
-
-    rows: np.ndarray
-    columns: np.ndarray
-    way: tuple[float, float]
-
-    def corners(self) -> list[tuple[slice, slice, np.float32]]:
-        """The four texels around each lookup: where they are among the window's, and their weight."""
-        lower, upper = slice(None, -1), slice(1, None)
-        y, x = self.way
-        return [
-            (row, column, np.float32(a * b))
-            for row, a in ((lower, 1 - y), (upper, y))
-            for column, b in ((lower, 1 - x), (upper, x))
-            if a * b > 0
-        ]
-
-    def moved(self, items: np.ndarray) -> np.ndarray:
-        """Interpolate the window's items, shape (rows, columns, …) -> (rows − 1, columns − 1, …)."""
-        parts = [items[row, column] * weight for row, column, weight in self.corners()]
-        return sum(parts[1:], parts[0])
-
-    def gathered(
-        self, slopes: np.ndarray, texels: tuple[int, int]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The transpose of :meth:`moved`: the items' slopes, and their rows and columns, each of them once."""
-        rows, columns = self.rows, self.columns
-        result = np.zeros((len(rows), len(columns), slopes.shape[-1]), np.float32)
-        for row, column, weight in self.corners():
-            result[row, column] += weight * slopes
-        # A window as large as the texture meets its own first row and column again.
-        if len(rows) > texels[0]:
-            result[0] += result[-1]
-            result, rows = result[:-1], rows[:-1]
-        if len(columns) > texels[1]:
-            result[:, 0] += result[:, -1]
-            result, columns = result[:, :-1], columns[:-1]
-        return result, rows, columns
-
-
-def _window(rng: np.random.Generator, texels: tuple[int, int], bilinear: bool) -> Window:
-    """A window anywhere in the texture."""
-    rows, columns = ((int(rng.integers(n)) + np.arange(min(SIDE, n) + 1)) % n for n in texels)
-    down, right = rng.random(2)
-    return Window(rows, columns, (float(down), float(right)) if bilinear else (0.0, 0.0))
-
-
 @reproducible()
 def fit(
-    btf: SampledBTF,
+    btf: BTFBlocks,
     *,
     seed: int = 0,
     progress: Progress | None = None,
@@ -172,7 +101,7 @@ def fit(
 
     Parameters
     ----------
-    btf : SampledBTF
+    btf : BTFBlocks
         Negative values count as 0.
     seed : int
         Of the start and of the order of the samples: same seed, same result.
@@ -207,9 +136,9 @@ def fit(
         raise InputError(
             "a parameter is out of range", field="passes", got=repr(passes), expected="a number above 0"
         )
-    samples = _samples(btf, filter_type == "bilinear")
+    samples = Samples.of(btf, filter_type == "bilinear")
     rng = np.random.default_rng(seed)
-    latent, layers = start(rng, samples.texels, hidden)
+    latent, layers = start(rng, btf.texels, hidden)
     steps = _descend(samples, latent, layers, rng, float(passes), progress or (lambda *_: None))
     maps = {"latent": stored("latent", latent, storage)}
     maps |= {name: stored(name, layer, storage) for name, layer in layers.items()}
@@ -220,24 +149,6 @@ def fit(
     meta["constants"] = edge_constants(btf)
     meta["fit"] = {"steps": steps} | _judged(samples, maps)
     return Representation(maps | direction_arrays(btf.views, btf.lights), meta)
-
-
-def _samples(btf: SampledBTF, bilinear: bool) -> Samples:
-    """What steps read of a BTF."""
-    views, lights = btf.views.vectors, btf.lights.vectors
-    pairs = len(views), len(lights)
-    total = np.zeros(3)
-    for values in btf.values:
-        refuse_not_finite(values, btf)
-        total += np.maximum(values, 0).sum((0, 1, 2), dtype=float)
-    mean, cosine = total / (btf.values.size / 3), float(lights[:, 2].mean())
-    return Samples(
-        btf.values.reshape(pairs[0] * pairs[1], *btf.values.shape[2:]),
-        network.code(np.tile(lights, (pairs[0], 1)), np.repeat(views, pairs[1], 0)).astype(np.float32),
-        np.tile(lights[:, 2], pairs[0]).astype(np.float32),
-        np.minimum(mean / max(cosine, 1e-3), LARGEST).astype(np.float32),
-        bilinear,
-    )
 
 
 def start(
@@ -280,7 +191,7 @@ def _descend(
     report: Progress,
 ) -> int:
     """Change the texels and the matrices in place; the number of steps."""
-    pairs, texels = len(samples.values), samples.texels
+    pairs, texels = len(samples.codes), samples.btf.texels
     if not samples.scale.any():
         return 0
     lookups = min(SIDE, texels[0]) * min(SIDE, texels[1])
@@ -288,33 +199,33 @@ def _descend(
     steps = max(1, round(passes * pairs * texels[0] * texels[1] / (lookups * width)))
     own = Adam(latent, TEXEL_STEP)
     shared = {name: Adam(layer, STEP) for name, layer in layers.items()}
-    order = np.zeros(0, int)
-    for step in range(steps):
-        if len(order) < width:
-            order = np.concatenate([order, rng.permutation(pairs)])
-        chosen, order = order[:width], order[width:]
-        window = _window(rng, texels, samples.bilinear)
-        here = latent[np.ix_(window.rows, window.columns)]
-        moved = window.moved(here).reshape(-1, latent.shape[-1])
-        y, tape = network.forward(moved, samples.codes[chosen], layers)
-        slope = _slope(y, _targets(samples, chosen, window), samples.cosine[chosen], samples.scale)
-        by_texel, by_layer = network.backward(tape, slope, layers)
-        share = 0.5 * (1 + math.cos(math.pi * step / steps))
-        shape = len(window.rows) - 1, len(window.columns) - 1, latent.shape[-1]
-        gradient, rows, columns = window.gathered(by_texel.reshape(shape), texels)
-        own.step(gradient, share, np.ix_(rows, columns))
-        for name, adam in shared.items():
-            adam.step(by_layer[name], share)
-        if step % 100 == 99 or step == steps - 1:
-            report(step + 1, steps, "steps")
+    order, first = np.zeros(0, int), 0
+    for band, last in samples.visits(steps, passes):
+        if first == last:
+            continue
+        values = samples.read(band)
+        for step in range(first, last):
+            if len(order) < width:
+                order = np.concatenate([order, rng.permutation(pairs)])
+            chosen, order = order[:width], order[width:]
+            window = a_window(rng, texels, samples.bilinear, band)
+            here = latent[np.ix_(window.rows, window.columns)]
+            moved = window.moved(here).reshape(-1, latent.shape[-1])
+            y, tape = network.forward(moved, samples.codes[chosen], layers)
+            targets = window.targets(values, chosen)
+            slope = _slope(y, targets, samples.cosine[chosen], samples.scale)
+            by_texel, by_layer = network.backward(tape, slope, layers)
+            share = 0.5 * (1 + math.cos(math.pi * step / steps))
+            shape = len(window.rows) - 1, len(window.columns) - 1, latent.shape[-1]
+            gradient, rows, columns = window.gathered(by_texel.reshape(shape), texels)
+            own.step(gradient, share, np.ix_(rows, columns))
+            for name, adam in shared.items():
+                adam.step(by_layer[name], share)
+            if step % 100 == 99 or step == steps - 1:
+                report(step + 1, steps, "steps")
+        first = last
+        del values  # before the next band is read
     return steps
-
-
-def _targets(samples: Samples, chosen: np.ndarray, window: Window) -> np.ndarray:
-    """B of a window's lookups under pairs of directions, shape (texels, pairs, 3)."""
-    values = samples.values[chosen[:, None, None], window.rows[:, None], window.columns]
-    moved = window.moved(np.moveaxis(values, 0, 2).astype(np.float32))
-    return np.maximum(moved, 0).reshape(-1, len(chosen), 3)
 
 
 def _slope(y: np.ndarray, targets: np.ndarray, cosine: np.ndarray, scale: np.ndarray) -> np.ndarray:
@@ -334,15 +245,17 @@ def _slope(y: np.ndarray, targets: np.ndarray, cosine: np.ndarray, scale: np.nda
 def _judged(samples: Samples, maps: dict[str, np.ndarray]) -> Facts:
     """Error and mean of the stored maps at all texels and some pairs of directions."""
     layers = {name: maps[name].astype(np.float32) for name in network.LAYERS}
-    chosen = np.unique(np.linspace(0, len(samples.values) - 1, JUDGED).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(samples.codes) - 1, JUDGED).round().astype(int))
     squares = energy = total = true = 0.0
-    for row, latent in enumerate(maps["latent"].astype(np.float32)):
-        y, _ = network.forward(latent, samples.codes[chosen], layers)
-        found = network.values(y, samples.cosine[chosen], samples.scale)
-        data = np.moveaxis(samples.values[chosen, row], 0, 1).astype(np.float32)
-        squares += float(((found - data) ** 2).sum(dtype=float))
-        energy += float((data**2).sum(dtype=float))
-        total, true = total + float(found.sum(dtype=float)), true + float(data.sum(dtype=float))
+    for band in samples.bands:
+        values = samples.read(band)
+        for row in range(band.first, band.last):
+            y, _ = network.forward(maps["latent"][row].astype(np.float32), samples.codes[chosen], layers)
+            found = network.values(y, samples.cosine[chosen], samples.scale)
+            data = np.moveaxis(values[chosen, row - band.first], 0, 1).astype(np.float32)
+            squares += float(((found - data) ** 2).sum(dtype=float))
+            energy += float((data**2).sum(dtype=float))
+            total, true = total + float(found.sum(dtype=float)), true + float(data.sum(dtype=float))
     return {
         "error": squares / energy if energy > 0 else 0.0,
         "mean_ratio": total / true if true > 0 else 1.0,

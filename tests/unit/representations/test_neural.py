@@ -12,6 +12,8 @@ from btfref.registry import method
 from btfref.representations import load, save
 from btfref.representations.neural import fit as fitting
 from btfref.representations.neural import network
+from btfref.representations.neural import samples as sampled
+from btfref.sampling.blocks import StreamedBTF
 from btfref.stress.lookups import hemisphere
 
 HIDDEN = 4
@@ -70,7 +72,7 @@ def test_derivatives_are_differences(net, rng):
 @pytest.mark.parametrize("texels", [(5, 7), (1, 3), (20, 18)])
 def test_a_window_gathers_what_it_spread(texels, rng):
     """Interpolation and its transpose: ⟨M z, s⟩ = ⟨z, Mᵀ s⟩, also where a window meets its own beginning."""
-    window = fitting._window(rng, texels, bilinear=True)
+    window = sampled.a_window(rng, texels, True, sampled.Band(0, texels[0], whole=True))
     z = rng.normal(size=(*texels, 2)).astype(np.float32)
     moved = window.moved(z[np.ix_(window.rows, window.columns)])
     slopes = rng.normal(size=moved.shape).astype(np.float32)
@@ -188,3 +190,45 @@ def test_the_port_passes_derivatives_of_every_map(tmp_path, need):
             expected = (ends[0] - ends[1]) / 2e-5
             assert abs(expected) > 0
             assert abs(found[at] / expected - 1) <= tolerance("neural.gradient.relative")
+
+
+def digests(btf, **parameters):
+    return {name: array.tobytes() for name, array in method("neural").fit(btf, **parameters).arrays().items()}
+
+
+def test_bands_are_from_store_and_memory_alike(tmp_path, monkeypatch):
+    """Three bands of rows, whatever of them may be kept; with one band the result is another one, as good."""
+    btf, few = oracle_btf((26, 4), views="2x3", lights="2x3"), {"hidden": HIDDEN, "passes": 3}
+    btf.save(tmp_path / "x.btf.zarr", tile=4)
+    whole = method("neural").fit(btf, **few)
+    monkeypatch.setattr(sampled, "TEXELS", 40)
+    expected = digests(btf, **few)
+    for spare in (0, 1 << 12, 1 << 20):
+        assert digests(StreamedBTF(tmp_path / "x.btf.zarr", spare=spare), **few) == expected
+    assert expected["latent"] != whole.maps["latent"].tobytes()
+    banded = method("neural").fit(btf, **few)
+    assert banded.meta["fit"]["steps"] == whole.meta["fit"]["steps"]
+    assert banded.meta["fit"]["error"] < tolerance("neural.bands.error") * whole.meta["fit"]["error"]
+
+
+@pytest.mark.parametrize(("texels", "most"), [((26, 4), 40), ((9, 3), 12), ((40, 64), 8), ((5, 5), 100)])
+def test_visits_see_all_rows_and_take_all_steps(texels, most, monkeypatch, rng):
+    monkeypatch.setattr(sampled, "TEXELS", most)
+    samples = sampled.Samples.of(oracle_btf(texels, views="2x3", lights="2x3"), True)
+    seen, done = set(), 0
+    for band, last in samples.visits(1000, 2.0):
+        assert last >= done
+        values = samples.read(band)
+        assert values.shape[1:3] == (band.last - band.first, texels[1])
+        for _ in range(done, last):
+            window = sampled.a_window(rng, texels, True, band)
+            assert (window.rows == (band.first + window.within) % texels[0]).all()
+            at = window.rows[0], window.columns[0]
+            np.testing.assert_array_equal(
+                values[0, window.within[0], at[1]], samples.btf.values[0, 0, at[0], at[1]]
+            )
+            seen |= set(zip(window.rows[:-1].tolist(), window.rows[1:].tolist(), strict=True))
+        done = last
+    assert done == 1000
+    # Every pair of neighbouring rows, over the edge too.
+    assert seen == {(row, (row + 1) % texels[0]) for row in range(texels[0])}

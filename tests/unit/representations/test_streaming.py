@@ -9,7 +9,7 @@ from oracle import oracle_btf
 from btfref.errors import InputError
 from btfref.registry import method, methods
 from btfref.representations import between
-from btfref.representations.fit_memory import FIT_BASE, least_budget, read_within, stated
+from btfref.representations.fit_memory import FIT_BASE, UNKNOWN, least_budget, read_within, stated
 from btfref.representations.gbrdf.decomposition import samples
 from btfref.sampling import SampledBTF, open_store
 from btfref.sampling.blocks import BTFBlocks, StreamedBTF, texel_values
@@ -95,9 +95,11 @@ def test_views_rows_and_texels_are_the_values(btf, path):
             np.testing.assert_array_equal(texel_values(source, texels), flat[:, :, texels])
 
 
-def test_what_does_not_stream_is_read_whole(path):
-    store = open_store(path)
-    assert isinstance(read_within(method("neural"), store, None), SampledBTF)
+def test_what_does_not_stream_is_read_whole(path, monkeypatch):
+    store, whole = open_store(path), method("neural")
+    assert isinstance(read_within(whole, store, None), StreamedBTF)
+    monkeypatch.setattr(whole.fitting, "FIT_MEMORY", UNKNOWN)
+    assert isinstance(read_within(whole, store, None), SampledBTF)
     assert isinstance(read_within(method("svd"), store, None), StreamedBTF)
     with pytest.raises(InputError, match="memory budget too small to fit svd"):
         read_within(method("svd"), store, FIT_BASE)
@@ -107,7 +109,7 @@ def test_a_large_btf_needs_little_of_its_size(path):
     """At 400² texels and 151² directions, 21.9 GB of half floats."""
     store = open_store(path)
     store.texels, store.views, store.lights = (400, 400), [None] * 151, [None] * 151
-    for key in ("svd", "lpca", "laplacian", "gbrdf"):
+    for key in ("svd", "lpca", "laplacian", "gbrdf", "neural"):
         assert least_budget(method(key), store) < 6 << 30
 
 
