@@ -20,6 +20,9 @@ from btfref.platform import MINIMUM_LLVM, choose_llvm
 #: The LLVM package asked for when apt cannot be queried.
 DEFAULT_LLVM_PACKAGE = "libllvm19"
 
+#: A download that breaks off is tried again; another apt, such as the daily one, is waited for.
+PATIENCE = ("-o", "Acquire::Retries=3", "-o", "DPkg::Lock::Timeout=120")
+
 
 @dataclass(frozen=True)
 class Requirement:
@@ -176,7 +179,7 @@ def install(
         if shutil.which("sudo") is None or run(["sudo", "-n", "true"], capture_output=True).returncode != 0:
             raise trouble
         prefix = ["sudo", "-n"]
-    apt = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get"]
+    apt = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get", *PATIENCE]
     # Lists may be absent (container images) or stale: refresh, and let the installation itself decide.
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
     run([*apt, "update", "-qq"], **quiet)
