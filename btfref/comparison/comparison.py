@@ -339,7 +339,7 @@ def _class_metrics(
     t: np.ndarray, r: np.ndarray, maps: Mapping[str, np.ndarray], ssim: np.ndarray, peak: float
 ) -> dict[str, float]:
     found = {"count": len(t), "mean_reference": float(r.mean()), "max_reference": float(np.abs(r).max())}
-    for name in ("bias", "bias_fraction", "mae", "rmse", "nrmse", "relmse", "smape"):
+    for name in ("bias", "bias_fraction", "mae", "rmse", "nrmse", "relative_l2", "relmse", "smape"):
         found[name] = getattr(metrics, name)(t, r)
     found["max_abs"] = float(np.abs(t - r).max())
     found["psnr"] = metrics.psnr(t, r, peak=peak)

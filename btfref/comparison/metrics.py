@@ -64,6 +64,14 @@ def nrmse(test: ArrayLike, reference: ArrayLike) -> float:
     return _ratio(rmse(test, reference), float(np.mean(np.abs(paired(test, reference)[1]))))
 
 
+def relative_l2(test: ArrayLike, reference: ArrayLike) -> float:
+    """RMSE divided by the root mean square of the reference; against black, infinite for an error and 0 for none.
+
+    Unlike :func:`nrmse` it is not larger for the same share of misplaced light where that light is a highlight.
+    """
+    return _ratio(rmse(test, reference), float(np.sqrt(np.mean(paired(test, reference)[1] ** 2))))
+
+
 def bias_fraction(test: ArrayLike, reference: ArrayLike) -> float:
     """Absolute bias divided by the mean absolute reference."""
     return _ratio(abs(bias(test, reference)), float(np.mean(np.abs(paired(test, reference)[1]))))

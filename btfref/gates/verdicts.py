@@ -19,6 +19,7 @@ _WORDS = {
     "nonfinite": ("pixels not finite", "pixels"),
     "max_abs": ("largest error", "largest error"),
     "nrmse": ("RMSE / mean", "RMSE / mean"),
+    "relative_l2": ("RMSE / root mean square", "RMSE / RMS"),
     "failing_fraction": ("share of failing pixels", "failing share"),
     "rejected_fraction": ("share of significant differences", "rejected share"),
     "relative_rmse": ("RMSE / mean without noise", "RMSE / mean"),

@@ -35,6 +35,7 @@ ROWS = {
     "rel_max": ("relative error, largest", "the worst pixel"),
     "rmse": ("RMSE", "root of the mean squared error of linear radiance"),
     "nrmse": ("RMSE / mean", "RMSE divided by the mean radiance of the reference"),
+    "relative_l2": ("RMSE / RMS", "RMSE divided by the root mean square radiance of the reference"),
     "bias": ("bias", "mean of test − reference"),
     "mae": ("MAE", "mean absolute error"),
     "relmse": ("relMSE", "mean of (test − reference)² / (reference² + ε)"),

@@ -143,10 +143,10 @@ class Hits:
         assert self._at is not None, "hits of no surface"
         return self._at
 
-    def moved(self, step: tuple[float, float]) -> Hits:
-        """The same hits, the shape's texture coordinates off by ``step``; directions and places stay."""
+    def moved(self, step: np.ndarray) -> Hits:
+        """The same hits, the shape's texture coordinates off by ``step`` (N, 2); directions and places stay."""
         surface, at = self._surface, self._at
-        return Hits(self.material, self._uv + np.asarray(step), self._wi, self._hand, surface=surface, at=at)
+        return Hits(self.material, self._uv + step, self._wi, self._hand, surface=surface, at=at)
 
     @cached_property
     def uv(self) -> JitArray:

@@ -50,7 +50,9 @@ def test_command_line(theirs, capsys):
     assert compare_command(folder, "my.exr", path, cache, "--json") == 0
     data = json.loads(capsys.readouterr().out)
     assert_follows_schema(data)
-    assert {"image.noise_free.p999", "image.silhouette.nrmse"} <= {gate["name"] for gate in data["gates"]}
+    assert {"image.noise_free.p999", "image.silhouette.relative_l2"} <= {
+        gate["name"] for gate in data["gates"]
+    }
     # Eight bits are judged by gates of their own, and a picture upside down by none of them passes.
     assert compare_command(folder, "my.png", path, cache) == 0
     judged = [line.split()[0] for line in capsys.readouterr().out.splitlines() if " ≤ " in line]

@@ -18,8 +18,11 @@ from btfref.types import SceneLike
 #: about 1e-6 of their range, as "image.noise_free" has it.
 ROUNDING = 1e-6
 
+#: Cosine of the view below which the distance grows no further.
+GRAZING = 0.1
+
 #: Steps by which each sample is moved, in `ROUNDING`.
-STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
+STEPS = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
 
 
 def uv_rounding(
@@ -33,7 +36,8 @@ def uv_rounding(
     """The most that some pixels change by when texture coordinates round, by the definition in float64.
 
     Every sample of a pixel is moved for itself, along u and v in both directions; the largest of its four changes
-    enters the mean, so that the sum is what all samples can do together.
+    enters the mean, so that the sum is what all samples can do together. A ray that is off by a distance meets a
+    surface off by that over the cosine of the view; steps are as long.
 
     Parameters
     ----------
@@ -69,10 +73,8 @@ def uv_rounding(
                 representation = filtered(loads[name], mesh.btf.filter_type)
                 hits = Hits.of(surface, mesh.shown, at)
                 there = radiance(representation, hits, *settings)
-                beside = [
-                    radiance(representation, hits.moved((ROUNDING * u, ROUNDING * v)), *settings)
-                    for u, v in STEPS
-                ]
+                far = ROUNDING / np.maximum(np.abs(hits.w_view[:, 2:]), GRAZING)
+                beside = [radiance(representation, hits.moved(far * step), *settings) for step in STEPS]
                 total[at] += mesh.btf.scale * np.abs(np.array(beside) - there).max(0)
     return (total / grid**2).reshape(*pixels.shape, 3)
 

@@ -121,7 +121,7 @@ FAULTS = (
     ),
     Fault(
         "edges rasterized a third of a pixel off",
-        "image.silhouette.nrmse",
+        "image.silhouette.relative_l2",
         "picture",
         edit=("hosts/mesh.vert", "vec4(position, 1.0);", "vec4(position, 1.0) + vec4(0.014, 0.0, 0.0, 0.0);"),
     ),
@@ -131,7 +131,7 @@ FAULTS = (
     Fault("light leaks into the background", "image.background.max_abs", "picture", change="background"),
     Fault(
         "the view meets the height field one cell off",
-        "image.mesostructure.nrmse",
+        "image.mesostructure.relative_l2",
         "picture",
         "gbrdf",
         (
@@ -148,7 +148,7 @@ FAULTS = (
     ),
     Fault(
         "shadows fall a fiftieth of the scene off",
-        "image.shadow_border.nrmse",
+        "image.shadow_border.relative_l2",
         "shadows",
         edit=(
             "lib/light/shadows.glsl",

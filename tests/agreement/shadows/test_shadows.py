@@ -122,7 +122,7 @@ FAULTS = {
     "beside": (
         "vec3 origin = point +",
         "vec3 origin = point + vec3(0.03, 0, 0) +",
-        "image.shadow_border.nrmse",
+        "image.shadow_border.relative_l2",
     ),
 }
 
@@ -175,7 +175,7 @@ def test_a_picture_with_shadows_is_compared_with_such_a_reference(fits, tmp_path
     assert main(["compare", out, *scene, *size, "--cache", cache, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["differs"] == []
-    assert "image.shadow_border.nrmse" in {gate["name"] for gate in found["gates"]}
+    assert "image.shadow_border.relative_l2" in {gate["name"] for gate in found["gates"]}
     assert main(["compare", out, *scene, *size, "--cache", cache, "--no-shadows"]) == 1
     assert "shadows in the test alone" in capsys.readouterr().out
 

@@ -148,7 +148,7 @@ def test_shadows_that_are_missing_are_caught(llvm, all_of_it, tmp_path, monkeypa
     monkeypatch.setattr(device, "shader_file", lambda rep: (shipped(rep)[0], [tmp_path]))
     scene, _, expected, classes = all_of_it(llvm)
     found = failed(realtime(scene, **SETTINGS), expected, classes)
-    assert {"image.noise_free.max", "image.shadow_border.nrmse"} <= set(found)
+    assert {"image.noise_free.max", "image.shadow_border.relative_l2"} <= set(found)
 
 
 def exact_shapes(mi, light):

@@ -58,7 +58,7 @@ def test_each_class_has_its_own_errors(scene):
     found = compare(test, reference, classes=classes, gate=["image.noise_free", "image.silhouette"])
     assert found.metrics["interior"]["max_abs"] == 0
     assert found.metrics["silhouette"]["bias"] == pytest.approx(0.1, rel=tolerance("metric.float32.rtol"))
-    assert names(found.gates) == {"image.silhouette.failing_fraction", "image.silhouette.nrmse"}
+    assert names(found.gates) == {"image.silhouette.failing_fraction", "image.silhouette.relative_l2"}
     assert not found.passed
 
 
@@ -136,7 +136,10 @@ def test_a_class_without_pixels_fails_unless_it_may_be_empty(scene):
         reference, reference, classes=np.zeros_like(classes), gate=["image.noise_free", "image.silhouette"]
     )
     assert names(found.gates) == {"image.noise_free.p999", "image.noise_free.max"}
-    assert names(found.gates, "empty") == {"image.silhouette.failing_fraction", "image.silhouette.nrmse"}
+    assert names(found.gates, "empty") == {
+        "image.silhouette.failing_fraction",
+        "image.silhouette.relative_l2",
+    }
 
 
 def test_negative_values_are_counted_and_not_clamped(scene):

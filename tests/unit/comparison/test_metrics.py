@@ -43,6 +43,7 @@ def test_errors_of_a_constant_offset():
     assert metrics.mae(t, r) == exact(0.5)
     assert metrics.rmse(t, r) == exact(0.5)
     assert metrics.nrmse(t, r) == exact(2.0)
+    assert metrics.relative_l2(t, r) == exact(2.0)
     assert metrics.bias_fraction(r, t) == exact(2 / 3)
     assert metrics.relmse(t, r, epsilon=0.01) == exact(0.25 / 0.0725)
     assert metrics.smape(t, r, epsilon=0.0) == exact(1.0)
@@ -54,6 +55,7 @@ def test_errors_of_two_values():
     assert metrics.bias(t, r) == exact(1.0)
     assert metrics.mae(t, r) == exact(2.0)
     assert metrics.rmse(t, r) == exact(np.sqrt(5.0))
+    assert metrics.relative_l2(t, r) == exact(np.sqrt(2.5))
     assert metrics.relmse(t, r, epsilon=1.0) == exact((1 / 5 + 9 / 1) / 2)
     assert metrics.smape(t, r, epsilon=1.0) == exact((2 / 4 + 6 / 4) / 2)
 
@@ -61,8 +63,8 @@ def test_errors_of_two_values():
 def test_equal_pictures():
     r = np.zeros((3, 3, 3))
     assert metrics.psnr(r, r, peak=1.0) == np.inf
-    assert metrics.nrmse(r, r) == 0
-    assert metrics.nrmse(r + 1, r) == np.inf
+    assert metrics.nrmse(r, r) == metrics.relative_l2(r, r) == 0
+    assert metrics.nrmse(r + 1, r) == metrics.relative_l2(r + 1, r) == np.inf
 
 
 def test_errors_accumulate_in_float64(rng):

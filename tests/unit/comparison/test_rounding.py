@@ -50,7 +50,7 @@ def test_many_pixels_are_no_rounding():
 
 
 class Moved:
-    """A representation whose texture lies elsewhere."""
+    """A representation whose texture lies elsewhere, the further the more it is seen from the side."""
 
     def __init__(self, of, step):
         self.of, self.step = of, np.asarray(step)
@@ -59,7 +59,8 @@ class Moved:
         return getattr(self.of, name)
 
     def evaluate(self, uv, w_light, w_view, **settings):
-        return self.of.evaluate(uv + self.step, w_light, w_view, **settings)
+        far = self.step / np.maximum(w_view[:, 2:], rounding.GRAZING)
+        return self.of.evaluate(uv + far, w_light, w_view, **settings)
 
 
 @pytest.fixture
