@@ -89,7 +89,8 @@ class Samples:
     def bands(self) -> list[Band]:
         """All rows, in bands of about the same height."""
         rows, columns = self.btf.texels
-        count = -(-rows // max(2, TEXELS // columns))
+        # Two rows at least: what is interpolated lies between them.
+        count = min(-(-rows // max(2, TEXELS // columns)), max(1, rows // 2))
         edges = [rows * k // count for k in range(count + 1)]
         return [Band(first, last, count == 1) for first, last in itertools.pairwise(edges)]
 

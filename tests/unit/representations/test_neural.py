@@ -211,7 +211,10 @@ def test_bands_are_from_store_and_memory_alike(tmp_path, monkeypatch):
     assert banded.meta["fit"]["error"] < tolerance("neural.bands.error") * whole.meta["fit"]["error"]
 
 
-@pytest.mark.parametrize(("texels", "most"), [((26, 4), 40), ((9, 3), 12), ((40, 64), 8), ((5, 5), 100)])
+@pytest.mark.parametrize(
+    ("texels", "most"),
+    [((26, 4), 40), ((9, 3), 12), ((40, 64), 8), ((41, 64), 8), ((3, 9), 8), ((5, 5), 100)],
+)
 def test_visits_see_all_rows_and_take_all_steps(texels, most, monkeypatch, rng):
     monkeypatch.setattr(sampled, "TEXELS", most)
     samples = sampled.Samples.of(oracle_btf(texels, views="2x3", lights="2x3"), True)
