@@ -73,10 +73,17 @@ HORIZON = 1e-6
 N_PROBED_PARTS = 3
 
 
-def ring_set(step: float) -> DirectionSet:
-    """Rings from the pole to the horizon, about ``step`` degrees apart and equally dense along each."""
+def ring_set(step: float, *, horizon: bool = True) -> DirectionSet:
+    """Rings from the pole to the horizon, about ``step`` degrees apart and equally dense along each.
+
+    Parameters
+    ----------
+    step : float
+    horizon : bool
+        With the ring on the horizon itself.
+    """
     n = max(1, int(np.ceil(90 / step - 1e-9)))
-    polar = np.arange(1, n + 1) * (90 / n)
+    polar = (np.arange(1, n + 1) * (90 / n))[: n if horizon else n - 1]
     counts = np.maximum(6, np.round(np.sin(np.radians(polar)) * 360 / step)).astype(int)
     return DirectionSet(
         ring_directions([(0, 1, 0), *((float(p), int(c), 0) for p, c in zip(polar, counts, strict=True))]),
@@ -100,7 +107,9 @@ class Resampling:
     def __init__(
         self, views: DirectionSet, lights: DirectionSet, half_step: float, map_size: int, four: bool
     ) -> None:
-        self.half_set = ring_set(half_step)
+        # No pair above the horizon has its half vector on it: samples there would be read, by the blend with the ring
+        # above, but never held by a pair of their own.
+        self.half_set = ring_set(half_step, horizon=False)
         self.difference_set = ring_set(DIFFERENCE_STEP)
         h, d = half_difference(lights.vectors[None], views.vectors[:, None])
         self.half_stencil = self.half_set.stencil(h.reshape(-1, 3))

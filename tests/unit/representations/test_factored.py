@@ -161,6 +161,19 @@ def test_more_sweeps_raise_nothing_between_the_samples(rng, four):
         assert held == (between > 0)
 
 
+@pytest.mark.parametrize("half_step", [2.0, 5.0, 30.0, 90.0])
+def test_every_half_vector_has_pairs_of_its_own(half_step):
+    """Half vectors on the horizon have none: samples there grew to 746 times a table's mean (rings at ubo81)."""
+    btf = oracle_btf((1, 1))
+    resampling = cmf.Resampling(btf.views, btf.lights, half_step, 8, False)
+    pairs_of = np.bincount(
+        resampling._between()[0] // len(resampling.difference_set), minlength=len(resampling.half_set)
+    )
+    assert len(pairs_of) == len(resampling.half_set)
+    assert (pairs_of > 0).all()
+    assert np.isfinite(cmf.fit(btf, half_step=half_step, map_size=8).meta["fit"]["error"])
+
+
 @pytest.mark.parametrize("key", KEYS)
 def test_products_are_recovered(key):
     """Data that are a product of three smooth factors leave the error of maps and half floats alone."""
