@@ -28,6 +28,7 @@ PARAMETERS = (
     "class",
     "may_be_empty",
     "floor",
+    "argument_ulps",
     "beyond_rounding",
     "failing_above",
     "significance",

@@ -65,7 +65,11 @@ def known_answers(
         lookups.w_light[::BELOW, 2] *= -1
         lookups.w_view[BELOW // 2 :: BELOW, 2] *= -1
         low, high = rounded_range(
-            representation, lookups, tolerance("stress.ports.argument_ulps"), neighbours=NEIGHBOURS
+            representation,
+            lookups.points,
+            tolerance("stress.ports.argument_ulps"),
+            lod=lookups.lod,
+            neighbours=NEIGHBOURS,
         )
         values = representation.evaluate(*lookups.points, lod=lookups.lod)
         kept = _steady(representation.meta["method"], low, high, values)
