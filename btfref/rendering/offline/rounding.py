@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
 from btfref import representations
+from btfref.rendering.environment_light.lighting import lighting_of
 from btfref.rendering.offline.approximate import filtered, radiance
 from btfref.scene.description import read_scene
 from btfref.scene.hits import Hits, surfaces
@@ -32,6 +34,8 @@ def uv_rounding(
     parameters: Mapping[str, object] | None = None,
     grid: int = 4,
     size: tuple[int, int] | None = None,
+    path: str = "auto",
+    **options: Any,
 ) -> np.ndarray:
     """The most that some pixels change by when texture coordinates round, by the definition in float64.
 
@@ -42,7 +46,7 @@ def uv_rounding(
     Parameters
     ----------
     scene : path-like or dict
-        With delta lights; without cast shadows.
+        Without cast shadows.
     pixels : ndarray of bool, shape (H, W)
         Those that are looked at.
     parameters : dict of str to str, optional
@@ -51,6 +55,8 @@ def uv_rounding(
         n of the n × n sub-pixel samples.
     size : (int, int), optional
         Width and height in place of the scene's.
+    path, **options
+        Of an environment, as for :func:`btfref.rendering.offline.approximate.approximate`.
 
     Returns
     -------
@@ -58,19 +64,22 @@ def uv_rounding(
         Radiance; 0 elsewhere, and where a plain material is seen.
     """
     description = read_scene(scene, parameters, size=size)
-    total, loads = np.zeros((pixels.size, 3)), {}
+    lighting = lighting_of(description, path, **options)
+    total, loads, lights = np.zeros((pixels.size, 3)), {}, {}
     with loaded(scene, parameters, size=size, plain=True) as made:
         shapes = drawn_shapes(made, [mesh.where for mesh in description.meshes])
         for surface in surfaces(made, grid):
-            for mesh, drawn in zip(description.meshes, shapes, strict=True):
+            for number, (mesh, drawn) in enumerate(zip(description.meshes, shapes, strict=True)):
                 at = np.flatnonzero(surface.sees(drawn) & pixels.ravel())
                 if mesh.material is None or not len(at):
                     continue
                 name = mesh.btf.filename
                 if name not in loads:
                     loads[name] = representations.load(name)
-                settings = mesh, description, grid, None
                 representation = filtered(loads[name], mesh.btf.filter_type)
+                if lighting is not None and number not in lights:
+                    lights[number] = lighting.prepared(representation, file=name, mesh=number)
+                settings = mesh, description, grid, lights.get(number)
                 hits = Hits.of(surface, mesh.shown, at)
                 there = radiance(representation, hits, *settings)
                 far = ROUNDING / np.maximum(np.abs(hits.w_view[:, 2:]), GRAZING)
@@ -85,6 +94,7 @@ def rounding_of(
     parameters: Mapping[str, object] | None = None,
     grid: int = 4,
     size: tuple[int, int] | None = None,
+    **options: Any,
 ) -> Callable[[np.ndarray], np.ndarray]:
     """`uv_rounding` of a scene for whatever pixels :func:`btfref.compare` asks for."""
-    return lambda pixels: uv_rounding(scene, pixels, parameters=parameters, grid=grid, size=size)
+    return lambda pixels: uv_rounding(scene, pixels, parameters=parameters, grid=grid, size=size, **options)

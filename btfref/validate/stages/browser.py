@@ -128,6 +128,7 @@ def environment_gates(file: PathLike, wanted: Sequence[str]) -> list[GateResult]
         return []
     from btfref.images import save_image
     from btfref.rendering.offline.approximate import approximate
+    from btfref.rendering.offline.rounding import rounding_of
     from btfref.rendering.web.context import webgl
     from btfref.representations import load
     from btfref.scene.pixel_classes import pixel_classes
@@ -148,7 +149,10 @@ def environment_gates(file: PathLike, wanted: Sequence[str]) -> list[GateResult]
         for way in ways:
             image = webgl(scene, environment=way, **shared, **WAYS[way]).image
             exact = approximate(scene, path=way, **shared, **WAYS[way]).image
-            compared = compare(image, exact, classes=classes, gate=ENVIRONMENT_GATES, flip=False)
+            rounding = rounding_of(scene, path=way, **shared, **WAYS[way])
+            compared = compare(
+                image, exact, classes=classes, gate=ENVIRONMENT_GATES, flip=False, rounding=rounding
+            )
             found += [gate.named(f"{TITLE}, {way}") for gate in compared.gates]
     return found
 

@@ -71,16 +71,20 @@ def scene(fits):
     }
 
 
-def test_it_is_the_largest_change_of_the_picture_within_a_step(scene, monkeypatch, llvm):
+@pytest.mark.parametrize(
+    ("lit_by", "way"), [("directional3", {}), ("envmap", {"path": "lights", "lights": 12})]
+)
+def test_it_is_the_largest_change_of_the_picture_within_a_step(scene, lit_by, way, monkeypatch, llvm):
     step = 1e-3
     monkeypatch.setattr(rounding, "ROUNDING", step)
-    found = uv_rounding("plane", np.full((8, 8), True), grid=1, **scene)
+    scene["parameters"] |= {"lights": lit_by} | ({"environment": "studio"} if way else {})
+    found = uv_rounding("plane", np.full((8, 8), True), grid=1, **scene, **way)
     table = representations.load(scene["parameters"]["btf"])
 
     def picture(u, v):
         # The texture is repeated twice: a step of the plane is two of the texture.
         moved = Moved(table, (2 * step * u, 2 * step * v))
-        return approximate("plane", grid=1, load_file=lambda file: moved, **scene).image.astype(float)
+        return approximate("plane", grid=1, load_file=lambda file: moved, **scene, **way).image.astype(float)
 
     there = picture(0, 0)
     changes = [abs(picture(*by) - there) for by in ((1, 0), (-1, 0), (0, 1), (0, -1))]
