@@ -32,34 +32,36 @@ def material_key(mesostructure: str, settings: Settings) -> str:
 
 
 def make_material(
-    cache: Cache, mesostructure: str, settings: Settings, progress: Progress | None = None
-) -> list[Path]:
-    """Synthesize a BTF and its twin, unless they are there.
+    cache: Cache,
+    mesostructure: str,
+    settings: Settings,
+    *,
+    twin: bool = False,
+    progress: Progress | None = None,
+) -> Path:
+    """Synthesize a BTF, or its twin of other random numbers, unless it is there.
 
     Returns
     -------
-    list of pathlib.Path
-        The stores.
+    pathlib.Path
+        The store.
     """
     from btfref.sampling.settings import SynthesisSettings
     from btfref.sampling.synthesis import synthesize
 
-    key, paths = material_key(mesostructure, settings), []
-    for twin in (0, 1):
-        made = SynthesisSettings(
-            texels=settings.texels,
-            views=settings.directions,
-            lights=settings.directions,
-            spp=settings.spp,
-            estimator=settings.estimator,
-            seed=settings.seed + TWIN * twin,
-        )
+    made = SynthesisSettings(
+        texels=settings.texels,
+        views=settings.directions,
+        lights=settings.directions,
+        spp=settings.spp,
+        estimator=settings.estimator,
+        seed=settings.seed + TWIN * twin,
+    )
 
-        def save(path: Path, made: SynthesisSettings = made) -> None:
-            synthesize(mesostructure, made, out=path, progress=progress)
+    def save(path: Path) -> None:
+        synthesize(mesostructure, made, out=path, progress=progress)
 
-        paths.append(cache.get(key, f".{twin}.btf.zarr", save))
-    return paths
+    return cache.get(material_key(mesostructure, settings), f".{int(twin)}.btf.zarr", save)
 
 
 @lru_cache(maxsize=2)

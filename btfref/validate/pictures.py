@@ -91,7 +91,6 @@ def _views(cache: Cache, mesostructure: str, scene: str | Path, lights: str, set
     from btfref.rendering.offline.reference import render
     from btfref.scene.pixel_classes import pixel_classes
 
-    stores = make_material(cache, mesostructure, settings)
     carrier = make_carrier(cache, mesostructure, settings)
     path = scene_file(scene)
     shared = shared_settings(carrier, lights, settings)
@@ -108,7 +107,8 @@ def _views(cache: Cache, mesostructure: str, scene: str | Path, lights: str, set
         )
         return Views(truth.batches, pictures.batches, np.zeros(0, np.float32), classes)
     seen = []
-    for store in stores:
+    for twin in (False, True):
+        store = make_material(cache, mesostructure, settings, twin=twin)
         table = method("raw").fit(load_material(store))
         seen.append(approximate(path, load_file=_always(table), **shared).image)
     return Views(truth.batches, seen[0][None], seen[1], classes)
@@ -135,7 +135,7 @@ def make_carrier(cache: Cache, mesostructure: str, settings: Settings) -> Path:
     from btfref.representations import save
 
     def save_carrier(path: Path) -> None:
-        btf = load_material(make_material(cache, mesostructure, settings)[0])
+        btf = load_material(make_material(cache, mesostructure, settings))
         save(method(CARRIER).fit(btf, **CARRIER_PARAMETERS), path)
 
     key = key_of({"carrier": CARRIER_PARAMETERS, "fit": fit_key(mesostructure, CARRIER, settings)})

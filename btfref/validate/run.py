@@ -140,7 +140,8 @@ def validate(
     materials = sorted({spec.mesostructure for spec in specs})
     views = sorted({(spec.mesostructure, spec.scene, spec.lights) for spec in specs})
     methods = [list(group) for _, group in groupby(specs, key=lambda s: (s.mesostructure, s.method))]
-    shared = ((_material_job, _material_keys), (_truth_job, _truth_keys))
+    # Nothing begins before its material is there: the longest ones first, each by itself.
+    shared = ((_material_job, _material_keys), (_twin_job, _twin_keys), (_truth_job, _truth_keys))
     stages: list[list[Job]] = [
         [Job(*job, (root, name, settings)) for job in shared for name in materials],
         [Job(_views_job, _views_keys, (root, *view, settings)) for view in views],
@@ -186,6 +187,16 @@ def _material_job(root: PathLike, mesostructure: str, settings: Settings) -> tup
 
 def _material_keys(mesostructure: str, settings: Settings) -> list[str]:
     return [material_key(mesostructure, settings), fit_key(mesostructure, CARRIER, settings)]
+
+
+def _twin_job(root: PathLike, mesostructure: str, settings: Settings) -> tuple[None, bool]:
+    cache = Cache(root)
+    make_material(cache, mesostructure, settings, twin=True)
+    return None, cache.computed > 0
+
+
+def _twin_keys(mesostructure: str, settings: Settings) -> list[str]:
+    return [material_key(mesostructure, settings)]
 
 
 def _truth_job(root: PathLike, mesostructure: str, settings: Settings) -> tuple[None, bool]:

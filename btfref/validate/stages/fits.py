@@ -31,7 +31,7 @@ def make_fit(cache: Cache, mesostructure: str, method: str, settings: Settings) 
     from btfref.representations import between, save
 
     def save_fit(path: Path) -> None:
-        btf = load_material(make_material(cache, mesostructure, settings)[0])
+        btf = load_material(make_material(cache, mesostructure, settings))
         save(between.fit(row(method), btf, seed=settings.seed), path)
 
     return cache.get(fit_key(mesostructure, method, settings), f".{method}.exr", save_fit)

@@ -54,7 +54,7 @@ def test_quick_validation_of_one_method(tmp_path, capsys):
         results.append(json.loads(capsys.readouterr().out))
     first, again = results
     assert first["passed"] is True
-    assert first["computed"] == first["jobs"] == 6
+    assert first["computed"] == first["jobs"] == 7
     assert again["computed"] == 0
     assert again["cells"] == first["cells"]
     assert len(first["cells"]) == 3

@@ -31,7 +31,7 @@ def green(tmp_path_factory):
     cache = tmp_path_factory.mktemp("green") / "cache"
     found = run(cache)
     assert [(name, gate.line) for name, gate in found.failed_gates] == []
-    assert found.computed == found.jobs == 4
+    assert found.computed == found.jobs == 5
     return cache
 
 
@@ -125,7 +125,7 @@ def test_several_processes_count_what_they_compute(cache):
     specs = [Spec(mesostructure, METHOD, scene, lights) for scene in ("plane", VIEW[1])]
     found = validate(specs, settings=SETTINGS, cache=cache, workers=2)
     # The views of the plane and both cells, in one job; the material and the other views are there.
-    assert (found.computed, found.jobs) == (2, 5)
+    assert (found.computed, found.jobs) == (2, 6)
     assert validate(specs, settings=SETTINGS, cache=cache, workers=2).computed == 0
 
 

@@ -143,8 +143,8 @@ def test_workers_find_the_cells_and_verdicts_of_one_process(tmp_path, plain, two
         SPECS, settings=SETTINGS, cache=tmp_path, scheduler=two, progress=lambda *call: calls.append(call)
     )
     assert found.passed
-    assert (found.computed, found.jobs) == (plain.computed, plain.jobs) == (5, 5)
-    assert calls[-1] == (5, 5, "validating")
+    assert (found.computed, found.jobs) == (plain.computed, plain.jobs) == (6, 6)
+    assert calls[-1] == (6, 6, "validating")
     assert without_times(found.to_dict()) == without_times(plain.to_dict())
     for one, other in zip(found.cells, plain.cells, strict=True):
         for name, image in one.images.items():
