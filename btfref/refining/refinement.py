@@ -1,9 +1,9 @@
 """Refinement of a fit: its maps follow the gradient of a loss at rows of true values.
 
 Adam (Kingma and Ba 2015) with steps relative to the size of each map's values, on random batches, the rate falling as a
-cosine. Some rows are held out. The maps that are best on these are kept, and the search ends when they get no better.
-Maps of halves are floats while they are refined; in the end they are rounded, and judged once more: what is worse than
-the start is not taken.
+cosine. What maps reflect beyond a limit counts as a loss too. Some rows are held out. The maps that are best on these
+are kept, and the search ends when they get no better. Maps of halves are floats while they are refined; in the end they
+are rounded, and judged once more: what is worse than the start is not taken.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from btfref.errors import InputError
-from btfref.numerics.sphere.quadrature import gauss_hemisphere
+from btfref.refining.energy import WEIGHT, excess, largest_albedo
 from btfref.refining.losses import LOSSES
 from btfref.refining.objectives import at_pixels, at_rows
 from btfref.refining.rows import rows_of
@@ -36,13 +36,10 @@ PERIOD, PATIENCE = 20, 8
 #: Share of the first rate that is left in the end.
 LAST_RATE = 0.05
 
-#: Texels, views and rule over the lights of the check of energy.
-ENERGY_TEXELS, ENERGY_VIEWS, ENERGY_RULE = 64, 6, (5, 12)
-
 #: By which the limit of albedos may be exceeded: halves.
 ENERGY_ROUNDING = 1e-3
 
-#: Halvings of the way from the start, where its end reflects too much.
+#: Halvings of the interval in which the way from the start is to end, where its end reflects too much.
 HALVINGS = 6
 
 
@@ -67,7 +64,7 @@ class Settings:
     loss: str = "delta_e"
     steps: int = 600
     batch: int = 8192
-    rate: float = 0.02
+    rate: float = 0.01
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -92,7 +89,7 @@ def refine(
     loss: str = "delta_e",
     steps: int = 600,
     batch: int = 8192,
-    rate: float = 0.02,
+    rate: float = 0.01,
     seed: int = 0,
     maps: Sequence[str] | None = None,
     footprint: str = "square",
@@ -172,8 +169,9 @@ def _refined(
     before = held.whole(variables)
     if not np.isfinite(before):
         raise InputError("values of the start are not finite somewhere", field="data", got=facts["data"])
-    best, history = _search(variables, used, held, before, settings, rng, progress)
-    made, found = _taken(variables, best, held, settings, before)
+    albedo = largest_albedo(variables.start, settings.seed)
+    best, history = _search(variables, used, held, before, most_reflected(albedo), settings, rng, progress)
+    made, found = _taken(variables, best, held, settings, before, albedo)
     done = {"steps_taken": history[-1][0], "history": history, "before": before}
     facts = facts | vars(settings) | {"maps": list(variables.names)} | done | found
     meta = made.meta | {"refined": [*made.meta.get("refined", []), facts]}
@@ -185,6 +183,7 @@ def _search(
     used: Objective,
     held: Objective,
     before: float,
+    limit: float,
     settings: Settings,
     rng: np.random.Generator,
     progress: Progress | None,
@@ -204,7 +203,7 @@ def _search(
         fall = 0.5 * (1 + np.cos(np.pi * step / settings.steps))
         optimizer.set_learning_rate(settings.rate * (LAST_RATE + (1 - LAST_RATE) * float(fall)))
         variables.put(dict(optimizer.items()))
-        dr.backward(used.batch(variables, rng))
+        dr.backward(used.batch(variables, rng) + WEIGHT * before * excess(variables, limit, rng))
         optimizer.step()
         for name, z in variables.held(dict(optimizer.items())).items():
             optimizer[name] = z
@@ -223,33 +222,36 @@ def _search(
 
 
 def _taken(
-    variables: Variables, best: Mapping[str, JitArray], held: Objective, settings: Settings, before: float
+    variables: Variables,
+    best: Mapping[str, JitArray],
+    held: Objective,
+    settings: Settings,
+    before: float,
+    albedo: float,
 ) -> tuple[Representation, Facts]:
     """The rounded maps, as far on the way to the best ones as energy allows; the start where these are no better."""
-    start = variables.start
-    albedo = largest_albedo(start, settings.seed)
-    limit = max(1.0, albedo) * (1 + ENERGY_ROUNDING)
-    share = 1.0
-    for _ in range(HALVINGS):
+    limit = most_reflected(albedo) * (1 + ENERGY_ROUNDING)
+
+    def at(share: float) -> tuple[Representation, float]:
         made = variables.representation(best, share)
-        found = largest_albedo(made, settings.seed)
-        if found <= limit:
-            variables.put_maps(made)
-            after = held.whole(variables)
-            if after < before:
-                return made, {"after": after, "share": share, "albedo": [albedo, found]}
-            break
-        share *= 0.5
-    return start, {"after": before, "share": 0.0, "albedo": [albedo, albedo]}
+        return made, largest_albedo(made, settings.seed)
+
+    low, high, share = 0.0, 1.0, 1.0
+    made, found = at(share)
+    if found > limit:
+        for _ in range(HALVINGS):
+            middle = (low + high) / 2
+            reflects = at(middle)[1] > limit
+            low, high = (low, middle) if reflects else (middle, high)
+        share = low
+        made, found = at(share)
+    variables.put_maps(made)
+    after = held.whole(variables)
+    if share > 0 and found <= limit and after < before:
+        return made, {"after": after, "share": share, "albedo": [albedo, found]}
+    return variables.start, {"after": before, "share": 0.0, "albedo": [albedo, albedo]}
 
 
-def largest_albedo(representation: Representation, seed: int = 0) -> float:
-    """Largest ``∫ B dω_light`` of some texels and views, by quadrature over the lights; 1 is a white surface."""
-    rng = np.random.default_rng([seed, 7])
-    light, weight = gauss_hemisphere(*ENERGY_RULE)
-    uv = rng.random((ENERGY_TEXELS, 1, 1, 2))
-    z, phi = rng.uniform(0.1, 1, ENERGY_VIEWS), rng.uniform(0, 2 * np.pi, ENERGY_VIEWS)
-    r = np.sqrt(1 - z * z)
-    view = np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
-    value = representation.evaluate(uv, light[None, None], view[None, :, None])
-    return float(np.einsum("tvlc,l->tvc", value, weight).max())
+def most_reflected(albedo: float) -> float:
+    """The largest albedo that is allowed where the start has some."""
+    return max(1.0, albedo)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 TEXELS, SPP = 32, 8
 
 #: Rows that fits are refined by, their samples and their seed, which is none of those that judge.
-ROWS, ROW_SPP, ROW_SEED = 200_000, 16, 77
+ROWS, ROW_SPP, ROW_SEED = 1_000_000, 8, 77
 
 #: Rows of each footprint that judge, and samples of each half.
 JUDGED, JUDGED_SPP = 2500, 64
@@ -34,7 +34,7 @@ JUDGED, JUDGED_SPP = 2500, 64
 METHODS = ("lpca", "rf_lobes", "lafortune", "cmf")
 
 #: Steps, and what is taken where less is asked for.
-STEPS = 200
+STEPS = 400
 QUICK_TEXELS, QUICK_STEPS, QUICK_ROWS = 8, 20, 5000
 
 

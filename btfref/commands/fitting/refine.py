@@ -49,7 +49,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--rate",
         type=number_above(0),
-        default=0.02,
+        default=0.01,
         metavar="R",
         help="of the first step, relative to the size of a map's values (default %(default)s)",
     )

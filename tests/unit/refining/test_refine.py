@@ -13,8 +13,9 @@ from btfref.comparison.colour import ciede2000, lab
 from btfref.errors import InputError
 from btfref.gates.tolerances import tolerance
 from btfref.images import save_image
+from btfref.refining import energy
+from btfref.refining.energy import largest_albedo
 from btfref.refining.losses import LOSSES
-from btfref.refining.refinement import largest_albedo
 from btfref.refining.variables import Variables
 
 #: Few lobes: the derivative's kernel is compiled sooner, and is no other code.
@@ -74,6 +75,35 @@ def test_types_and_ranges_are_kept(start, refined):
     assert refined.arrays()["colour"].min() >= 0
     limit = max(1.0, largest_albedo(start)) * (1 + tolerance("refine.energy.above"))
     assert largest_albedo(refined) <= limit
+
+
+def test_rows_that_reflect_more_than_falls_on_them_are_followed_as_far_as_energy_allows(start, rows, need):
+    need("llvm")
+    factor = 2 / largest_albedo(start)
+    made = btfref.refine(
+        start, rows | {"B": factor * rows["B"]}, loss="log", steps=STEPS, batch=2000, rate=0.05
+    )
+    facts = made.meta["refined"][0]
+    assert largest_albedo(start) < largest_albedo(made) <= 1 + tolerance("refine.energy.above")
+    assert 0 < facts["share"] <= 1
+    assert facts["after"] < facts["before"]
+
+
+def test_what_is_reflected_beyond_a_limit_is_that_of_the_definition(start, need):
+    need("llvm")
+    variables = Variables(start)
+    variables.put(variables.zeros())
+    limit = largest_albedo(start) / 2
+    found = float(energy.excess(variables, limit, np.random.default_rng(3))[0])
+    rng = np.random.default_rng(3)
+    light, weight = energy.gauss_hemisphere(*energy.RULE)
+    uv, view = rng.random((energy.PLACES, 1, 2)), energy._views(rng, energy.PLACES)[:, None]
+    albedo = np.einsum("nlc,l->nc", start.evaluate(uv, light[None], view), weight)
+    expected = (np.maximum(albedo / limit - energy.FREE, 0) ** 2).sum(-1).mean()
+    assert expected > 0
+    np.testing.assert_allclose(found, expected, rtol=tolerance("probe.agreement.max"))
+    # The start itself is within its own limit.
+    assert float(energy.excess(variables, 10 * limit, np.random.default_rng(3))[0]) == 0
 
 
 def test_what_gets_worse_is_not_taken(start, rows):
