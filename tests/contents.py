@@ -146,10 +146,15 @@ def with_hostile_fact(arrays, meta, rng):
     holder[path[-1]] = new
     # Names of sets are records; a surface may lie at any height.
     free = (path[-1] == "name" and isinstance(new, str)) or (path[-1] == "filter_type" and new == old)
-    free = free or (isinstance(old, bool) and isinstance(new, bool))  # a choice of the fit
+    # Choices of the fit: the file is a sound one of another material.
+    free = free or (isinstance(old, bool) and isinstance(new, bool))
+    free = free or (path[-1] in POWERS and type(new) is int and new in POWERS[path[-1]])
     height = path[-1] in ("height_min", "height_max", *DERIVED)
     return arrays, meta, f"{path} = {new!r}", free or height or _same(old, new)
 
+
+#: Powers that codes may be raised to.
+POWERS = {"map_power": (1, 4), "scale_power": (1, 4)}
 
 #: Constants of height fields that are made anew of the heights.
 DERIVED = ("top", "bottom", "tangent_limit", "lift", "maximum_steps")

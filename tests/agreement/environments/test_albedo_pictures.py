@@ -17,6 +17,7 @@ from btfref.rendering.environment_light.lighting import Lighting
 from btfref.rendering.environment_light.prepared import Prepared
 from btfref.rendering.gl.realtime import realtime
 from btfref.rendering.offline.approximate import approximate
+from btfref.scene import environment
 from btfref.scene.pixel_classes import pixel_classes
 from btfref.scene.shipped import scene_file
 
@@ -70,6 +71,9 @@ def test_a_constant_environment_shows_the_albedo(fits, monkeypatch, key, scene):
     settings = {"parameters": parameters, "grid": 1, "size": SIZE}
     file = scene_file(scene)
     lights, nodes = FINER.get(key, (LIGHTS, NODES))
+    if key in FINER:
+        # The coarse environment has fewer cells than that.
+        monkeypatch.setattr(environment, "CELL_ROWS", 2 * environment.CELL_ROWS)
     image = realtime(file, environment="lights", lights=lights, **settings)
     assert image.meta["environment_lights"] == lights
     monkeypatch.setattr(
